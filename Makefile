@@ -20,7 +20,7 @@ FEED := .venv-feed
 OAK := .venv-oak
 REQUIREMENTS := python/requirements-test.txt $(READERS)/requirements.txt
 
-.PHONY: help demo test check-debian13 test-long vm fuzz lint bench bench-peers bench-feed clean setup-build setup-test setup-vm setup-peers setup-fuzz
+.PHONY: help demo environments test check-debian13 test-long vm fuzz lint bench bench-peers bench-feed clean setup-build setup-test setup-vm setup-peers setup-fuzz
 
 help: ## show this list
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-14s %s\n", $$1, $$2}'
@@ -29,7 +29,9 @@ demo: setup-build ## the mount of seven cameras with ten depth modes, without a 
 	@tools/onnxruntime.sh || true
 	tools/demo.sh $(ARGS)
 
-test: setup-test $(VENV)/.stamp $(LEROBOT)/.stamp $(OAK)/.stamp $(READERS)/node_modules/.stamp ## every test: Rust, Python, third-party readers, the virtual machine
+environments: $(VENV)/.stamp $(LEROBOT)/.stamp $(OAK)/.stamp $(READERS)/node_modules/.stamp ## the environments of Python and Node that tests need
+
+test: setup-test environments ## every test: Rust, Python, third-party readers, the virtual machine
 	@tools/onnxruntime.sh || true
 	tools/test.sh
 
@@ -97,12 +99,15 @@ setup-peers:
 $(VENV)/.stamp: $(REQUIREMENTS) python/pyproject.toml
 	python3 -m venv $(VENV)
 	$(VENV)/bin/pip install --quiet $(addprefix --requirement ,$(REQUIREMENTS)) --editable ./python
+	rm -rf $(VENV)/lib/python3*/site-packages/rerun_cli # the viewer; tests read with the library
 	touch $@
 
-$(LEROBOT)/.stamp: tests/python/requirements-lerobot.txt
+$(LEROBOT)/.stamp: tests/python/requirements-lerobot.txt tests/python/without_cuda.py
 	for python in python3.12 $$HOME/.pyenv/versions/3.12*/bin/python python3; do \
 		"$$python" -c 'import venv' 2>/dev/null && break; done && "$$python" -m venv --clear $(LEROBOT)
 	$(LEROBOT)/bin/pip install --quiet --no-deps --no-compile --no-cache-dir --requirement $<
+	$(LEROBOT)/bin/python tests/python/without_cuda.py
+	rm -rf $(LEROBOT)/lib/python3*/site-packages/torch/include
 	touch $@
 
 $(PEERS_VENV)/.stamp: $(PEERS)/requirements.txt

@@ -120,7 +120,7 @@ beside=$!
 set +m
 trap 'kill -- -"$beside" 2>/dev/null; rm -rf "$home"' EXIT
 
-step rust "$runner" "$built" --without depthrig-tests:storage_faults
+step rust "$runner" "$built" --jobs 2 --without depthrig-tests:storage_faults
 # rustdoc compiles these into a folder that only its own user can enter.
 step rust-doc box --as-root -- cargo test --workspace --doc --no-fail-fast --quiet
 step binary tools/check_binary.sh "$DEPTHRIG_BIN"

@@ -2,7 +2,7 @@
 """Runs test executables that cargo has built, each in a box (box.py), and counts their results.
 
     cargo test --workspace --no-run --message-format=json >MESSAGES
-    tests/runner/rust.py MESSAGES [--only CRATE[:TARGET][=FILTER]]... [--without CRATE:TARGET]... [--shm MIB] [--nofile N] [--busy N]
+    tests/runner/rust.py MESSAGES [--only CRATE[:TARGET][=FILTER]]... [--without CRATE:TARGET]... [--shm MIB] [--nofile N] [--busy N] [--jobs N]
 
 A test that has not ended `DEPTHRIG_TEST_LIMIT_S` seconds (600) after the one before it is killed with all that it
 started, and named. A test that says "skipped: why" and passes is counted as skipped, and so is one that fails because it
@@ -13,12 +13,16 @@ missing and may be (`DEPTHRIG_DATA_MISSING`). Names of skipped tests go to stdou
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 import json
 import os
 import re
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
+from multiprocessing import get_context
 from pathlib import Path
 
 sys.dont_write_bytecode = True
@@ -92,11 +96,9 @@ class Outcome:
 
 @dataclass
 class Totals:
-    """Counts over all executables."""
+    """Results of an executable."""
 
-    passed: int = 0
     failed: int = 0
-    ignored: int = 0
     skipped: list[str] = field(default_factory=list)
 
 
@@ -130,8 +132,15 @@ def names_of(executable: Executable, box: Box, filters: list[str], env: dict[str
     return [line.removesuffix(": test") for line in lines if line.endswith(": test")]
 
 
-def run(executable: Executable, box: Box, filters: list[str], programs: dict[str, str], totals: Totals) -> bool:
-    """Runs an executable and prints its results; returns whether it passed."""
+def run(executable: Executable, box: Box, filters: list[str], programs: dict[str, str]) -> tuple[str, Totals]:
+    """Runs an executable; returns what there is to print of it, and its counts."""
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        totals = results_of(executable, box, filters, programs)
+    return printed.getvalue(), totals
+
+
+def results_of(executable: Executable, box: Box, filters: list[str], programs: dict[str, str]) -> Totals:
+    """Runs an executable and prints its results."""
     env = executable.environment(programs)
     box.mounts = (executable.crate, executable.target) in NEEDS_MOUNTS
     outcome = Outcome()
@@ -164,11 +173,7 @@ def run(executable: Executable, box: Box, filters: list[str], programs: dict[str
     took = time.monotonic() - started
     line = f"test result: {word}. {passed} passed; {len(failed)} failed; {ignored} ignored; {len(skipped)} skipped"
     print(f"{line}; {took:.1f} s: {executable.name}", flush=True)
-    totals.passed += passed
-    totals.failed += len(failed)
-    totals.ignored += ignored
-    totals.skipped += [f"{executable.crate} {name}: {why}" for name, why in skipped]
-    return not failed
+    return Totals(len(failed), [f"{executable.crate} {name}: {why}" for name, why in skipped])
 
 
 def main() -> int:
@@ -180,6 +185,7 @@ def main() -> int:
     parser.add_argument("--shm", type=int, metavar="MIB", help="size of /dev/shm")
     parser.add_argument("--nofile", type=int, metavar="N", help="most descriptors of a process")
     parser.add_argument("--busy", type=int, default=0, metavar="N", help="busy loops beside each executable")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="executables at once; most tests wait")
     args = parser.parse_args()
     executables, programs = read_messages(args.messages)
     executables = [e for e in executables if f"{e.crate}:{e.target}" not in args.without]
@@ -193,14 +199,23 @@ def main() -> int:
             print(f"no test executable is {only}", file=sys.stderr)
             return 1
         wanted += [(e, ([name] if name else []) + skips) for e in found]
-    totals = Totals()
     box = Box(shm_mib=args.shm, nofile=args.nofile, busy=args.busy)
-    failures = [e.name for e, filters in wanted if not run(e, box, filters, programs, totals)]
-    for line in totals.skipped:
+    failures: list[str] = []
+    skipped: list[str] = []
+    # Processes, not threads: a box kills all descendants of its process.
+    with ProcessPoolExecutor(args.jobs, mp_context=get_context("fork")) as pool:
+        running = [(e, pool.submit(run, e, box, filters, programs)) for e, filters in wanted]
+        for executable, ended in running:
+            text, totals = ended.result()
+            print(text, end="", flush=True)
+            skipped += totals.skipped
+            if totals.failed:
+                failures.append(executable.name)
+    for line in skipped:
         print(f"skipped {line}")
-    if (path := os.environ.get("DEPTHRIG_TEST_SKIPS")) and totals.skipped:
+    if (path := os.environ.get("DEPTHRIG_TEST_SKIPS")) and skipped:
         with open(path, "a") as file:
-            file.writelines(f"{line}\n" for line in totals.skipped)
+            file.writelines(f"{line}\n" for line in skipped)
     if failures:
         print(f"failed: {', '.join(failures)}")
     return 1 if failures or not wanted else 0

@@ -172,3 +172,20 @@ def test_a_test_that_says_it_was_skipped_is_not_passed(tmp_path: Path) -> None:
     assert done.returncode == 0
     assert "0 passed; 0 failed; 0 ignored; 1 skipped" in done.stdout
     assert "skipped fake a: no disk" in done.stdout
+
+
+def test_jobs_run_at_once_and_are_all_counted(tmp_path: Path) -> None:
+    # Each of two executables waits for a file that the other one writes.
+    lines = []
+    for mine, other in (("one", "two"), ("two", "one")):
+        folder = tmp_path / mine
+        folder.mkdir()
+        wait = f"touch {tmp_path}/{mine}.there; until [ -e {tmp_path}/{other}.there ]; do sleep 0.1; done"
+        lines.append(fake(folder, f'{wait}; echo "test {mine} ... ok"; {ENDED % "ok"}').read_text())
+    messages = tmp_path / "messages"
+    messages.write_text("".join(lines))
+    done = run(RUST, messages, "--jobs", "2", DEPTHRIG_TEST_LIMIT_S="20")
+    assert done.returncode == 0, done.stdout
+    assert done.stdout.count("test result: ok. 1 passed; 0 failed") == 2
+    done = run(RUST, messages, DEPTHRIG_TEST_LIMIT_S="20")
+    assert done.returncode == 0, "their files are there now"
