@@ -102,23 +102,26 @@ oak_crate() {
         "${cargo[@]}" test --manifest-path drivers/oak/Cargo.toml --locked --quiet --no-run \
             --message-format=json-render-diagnostics >"$logs/oak.json" && "$runner" "$logs/oak.json"
 }
-beside() {
+beside_compiling() {
     step oak-crate oak_crate
-
+    step python-oak optional "the OAK bridge with its SDK" tools/python.sh oak
+}
+beside() {
     step python box -- "${tests[@]}" python/tests
     step python-small box "${small[@]}" --nofile 64 -- "${tests[@]}" -m "not many_streams" \
         python/tests/test_stream.py python/tests/test_fresh.py python/tests/test_motion.py
     # The wheel on other versions of Python, and with PyTorch.
     step python-versions tools/python.sh versions
     step python-torch optional "tests with PyTorch" tools/python.sh torch
-    step python-oak optional "the OAK bridge with its SDK" tools/python.sh oak
 }
 # These wait more than they compute, so they run beside the tests in Rust; their output is printed when both have ended.
 set -m # in a process group of its own, which ends with this script
 beside >"$logs/beside" 2>&1 &
 beside=$!
+beside_compiling >"$logs/beside-compiling" 2>&1 &
+compiling=$!
 set +m
-trap 'kill -- -"$beside" 2>/dev/null; rm -rf "$home"' EXIT
+trap 'kill -- -"$beside" -"$compiling" 2>/dev/null; rm -rf "$home"' EXIT
 
 step rust "$runner" "$built" --jobs 2 --without depthrig-tests:storage_faults
 # rustdoc compiles these into a folder that only its own user can enter.
@@ -152,9 +155,9 @@ readers -rank golden rank python
 readers -stereo golden stereo python node
 readers -zed zed_replay_golden "" python node
 
-wait "$beside"
+wait "$beside" "$compiling"
 trap 'rm -rf "$home"' EXIT
-cat "$logs/beside"
+cat "$logs/beside" "$logs/beside-compiling"
 # Shows that a failing disk does not delay a camera, so nothing else may.
 step rust-quiet "$runner" "$built" --only depthrig-tests:storage_faults
 

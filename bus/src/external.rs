@@ -16,7 +16,6 @@ mod mode;
 mod place;
 mod plain;
 mod session;
-mod text;
 
 pub use camera::ExternalCamera;
 pub use codes::{

@@ -4,6 +4,7 @@
 //! within one [`HEADER_VERSION`]; new fields take space from `reserved`. Every field lies at a multiple of
 //! its size, so nothing is padded implicitly, and [`FIELDS`] lists them for mirrors in other languages.
 
+use crate::text;
 use crate::{DropCounts, Intrinsics, PixelFormat, Pose, StreamId};
 use core::fmt;
 use iceoryx2::prelude::ZeroCopySend;
@@ -202,36 +203,41 @@ impl FrameHeader {
 
     /// The stream this frame is of, if the names are valid ones.
     pub fn stream_id(&self) -> Option<StreamId> {
-        StreamId::new(text(&self.camera), text(&self.stream)).ok()
+        StreamId::new(text::valid_part(&self.camera), text::valid_part(&self.stream)).ok()
     }
 
     /// Writes the names of rig and stream.
     pub fn set_names(&mut self, rig: &str, id: &StreamId) {
-        set_text(&mut self.rig, rig);
-        set_text(&mut self.camera, id.camera.as_str());
-        set_text(&mut self.stream, id.stream.as_str());
+        text::set(&mut self.rig, rig);
+        text::set(&mut self.camera, id.camera.as_str());
+        text::set(&mut self.stream, id.stream.as_str());
     }
 
     /// Writes model and serial number; what does not fit in 31 bytes is cut at a character boundary.
     pub fn set_device(&mut self, model: &str, serial: &str) {
-        set_text(&mut self.model, model);
-        set_text(&mut self.serial, serial);
+        text::set(&mut self.model, model);
+        text::set(&mut self.serial, serial);
     }
 
     /// Writes the method and the model of a derived frame; each is cut to 31 bytes at a character boundary.
     pub fn set_refiner(&mut self, refiner: &str, model: &str) {
-        set_text(&mut self.refiner, refiner);
-        set_text(&mut self.refiner_model, model);
+        text::set(&mut self.refiner, refiner);
+        text::set(&mut self.refiner_model, model);
+    }
+
+    /// Names the stream alone.
+    pub fn set_stream(&mut self, stream: &crate::StreamName) {
+        text::set(&mut self.stream, stream.as_str());
     }
 
     /// Method that computed this frame, such as `fill`; empty when it was captured.
     pub fn refiner(&self) -> &str {
-        text(&self.refiner)
+        text::valid_part(&self.refiner)
     }
 
     /// The model that it used; empty when it needs none.
     pub fn refiner_model(&self) -> &str {
-        text(&self.refiner_model)
+        text::valid_part(&self.refiner_model)
     }
 
     /// Duration of `step` of computing this frame, nanoseconds.
@@ -241,27 +247,27 @@ impl FrameHeader {
 
     /// The rig's name.
     pub fn rig(&self) -> &str {
-        text(&self.rig)
+        text::valid_part(&self.rig)
     }
 
     /// The camera's name.
     pub fn camera(&self) -> &str {
-        text(&self.camera)
+        text::valid_part(&self.camera)
     }
 
     /// The stream's name.
     pub fn stream(&self) -> &str {
-        text(&self.stream)
+        text::valid_part(&self.stream)
     }
 
     /// The camera's model.
     pub fn model(&self) -> &str {
-        text(&self.model)
+        text::valid_part(&self.model)
     }
 
     /// The camera's serial number.
     pub fn serial(&self) -> &str {
-        text(&self.serial)
+        text::valid_part(&self.serial)
     }
 }
 
@@ -281,21 +287,6 @@ impl fmt::Debug for FrameHeader {
             self.flags
         )
     }
-}
-
-/// Text in a zero-padded field; an invalid tail is left out.
-fn text(field: &[u8; 32]) -> &str {
-    let len = field.iter().position(|b| *b == 0).unwrap_or(field.len());
-    match core::str::from_utf8(&field[..len]) {
-        Ok(s) => s,
-        Err(e) => core::str::from_utf8(&field[..e.valid_up_to()]).unwrap_or_default(),
-    }
-}
-
-fn set_text(field: &mut [u8; 32], s: &str) {
-    let end = s.floor_char_boundary(field.len() - 1);
-    *field = [0; 32];
-    field[..end].copy_from_slice(&s.as_bytes()[..end]);
 }
 
 /// Facts about a frame, one bit each.

@@ -23,6 +23,7 @@ mod sets;
 pub mod shm;
 mod subscriber;
 pub mod sync;
+mod text;
 pub mod umask;
 
 pub use channel::{BUFFER as SUBSCRIBER_BUFFER, MAX_LENT};

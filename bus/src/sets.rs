@@ -3,6 +3,7 @@
 //! A set message names frames by stream and sequence number; their pixels are in the streams' own channels.
 
 use crate::channel::{self, Received, Receiver, Sender};
+use crate::text;
 use crate::{Error, ErrorKind, HostTime, Result, StreamId};
 use core::time::Duration;
 use iceoryx2::prelude::ZeroCopySend;
@@ -46,24 +47,21 @@ impl MemberRecord {
     /// The record's bytes: camera 32, stream 32, sequence 8, capture time 8, present 8, zero 8.
     fn encode(&self, out: &mut [u8]) {
         out.fill(0);
-        let camera = self.id.camera.as_str();
-        let stream = self.id.stream.as_str();
-        out[..camera.len()].copy_from_slice(camera.as_bytes());
-        out[32..32 + stream.len()].copy_from_slice(stream.as_bytes());
+        let mut name = [0; 32];
+        text::set(&mut name, self.id.camera.as_str());
+        out[..32].copy_from_slice(&name);
+        text::set(&mut name, self.id.stream.as_str());
+        out[32..64].copy_from_slice(&name);
         out[64..72].copy_from_slice(&self.sequence.unwrap_or(0).to_le_bytes());
         out[72..80].copy_from_slice(&self.capture_time_ns.to_le_bytes());
         out[80..88].copy_from_slice(&u64::from(self.sequence.is_some()).to_le_bytes());
     }
 
     fn decode(bytes: &[u8]) -> Option<Self> {
-        let text = |range: core::ops::Range<usize>| {
-            let field = bytes.get(range)?;
-            let len = field.iter().position(|b| *b == 0).unwrap_or(field.len());
-            core::str::from_utf8(&field[..len]).ok()
-        };
         let word = |at: usize| Some(u64::from_le_bytes(bytes.get(at..at + 8)?.try_into().ok()?));
         Some(Self {
-            id: StreamId::new(text(0..32)?, text(32..64)?).ok()?,
+            id: StreamId::new(text::valid_part(bytes.get(0..32)?), text::valid_part(bytes.get(32..64)?))
+                .ok()?,
             sequence: (word(80)? != 0).then_some(word(64)?),
             capture_time_ns: word(72)? as i64,
         })

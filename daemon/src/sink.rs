@@ -3,8 +3,7 @@
 use crate::stream::{Books, Reached, Stream};
 use crate::wake::Wake;
 use depthrig_bus::{
-    DropReason, FrameFlags, FrameHeader, FrameMut, HostTime, MOTION_SAMPLE_BYTES, MetadataLevel, PixelFormat,
-    Publisher,
+    DropReason, FrameHeader, FrameMut, HostTime, MOTION_SAMPLE_BYTES, PixelFormat, Publisher,
 };
 use depthrig_driver::clock::ClockQuality;
 use depthrig_driver::{FrameMeta, FrameSink, Loan};
@@ -57,7 +56,7 @@ impl Port {
             // A batch is as wide as it has samples.
             template.set_image(PixelFormat::Motion, payload_len / MOTION_SAMPLE_BYTES as u32, 1);
         }
-        *frame.header_mut() = FrameHeader {
+        let header = FrameHeader {
             sequence: books.delivered + 1,
             device_sequence: meta.device_sequence,
             device_time: meta.device_time,
@@ -75,19 +74,13 @@ impl Port {
             payload_len,
             ..template
         };
+        *frame.header_mut() = header;
         if let Err(e) = self.publisher.send(frame) {
             books.dropped.add(DropReason::NoSlot, 1);
             tracing::error!(stream = %self.stream.id, error = %e, "a frame was lost on its way to the subscribers");
             return;
         }
-        let now = HostTime::now();
-        books.delivered += 1;
-        books.epoch = books.epoch_base + meta.clock_epoch;
-        books.uncertainty_ns = meta.capture_uncertainty_ns;
-        books.uncertain += u64::from(meta.flags.has(FrameFlags::TIME_UNCERTAIN));
-        books.note_metadata(MetadataLevel::of(meta.clock_domain, meta.flags), meta.flags);
-        let samples = if self.stream.profile.format.is_motion() { template.width } else { 1 };
-        books.note(now, now.since_ns(meta.capture_time), samples);
+        books.published(&header, HostTime::now().since_ns(meta.capture_time));
     }
 }
 

@@ -5,7 +5,8 @@
 
 use depthrig_bus::sync::lock;
 use depthrig_bus::{
-    DropCounts, DropReason, FrameFlags, HostTime, MetadataLevel, Publisher, StreamId, Subscriber,
+    DropCounts, DropReason, FrameFlags, FrameHeader, HostTime, MetadataLevel, PixelFormat, Publisher,
+    StreamId, Subscriber,
 };
 use depthrig_driver::StreamProfile;
 use depthrig_driver::clock::ClockQuality;
@@ -158,7 +159,7 @@ impl Books {
     }
 
     /// Notes a published frame; a batch of an IMU has more than one sample.
-    pub fn note(&mut self, published: HostTime, latency_ns: i64, samples: u32) {
+    fn note(&mut self, published: HostTime, latency_ns: i64, samples: u32) {
         if self.recent.len() == WINDOW {
             self.recent.pop_front();
         }
@@ -166,8 +167,19 @@ impl Books {
         self.last_frame = Some(published);
     }
 
+    /// Accounts for a frame that was published under this header, `latency_ns` after it was captured.
+    pub fn published(&mut self, header: &FrameHeader, latency_ns: i64) {
+        self.delivered += 1;
+        self.epoch = header.clock_epoch;
+        self.uncertainty_ns = header.capture_uncertainty_ns;
+        self.uncertain += u64::from(header.has(FrameFlags::TIME_UNCERTAIN));
+        self.note_metadata(header.metadata_level(), FrameFlags(header.flags));
+        let is_motion = header.pixel_format().is_some_and(PixelFormat::is_motion);
+        self.note(HostTime::now(), latency_ns, if is_motion { header.width } else { 1 });
+    }
+
     /// Notes the source of the times of a published frame.
-    pub const fn note_metadata(&mut self, level: MetadataLevel, flags: FrameFlags) {
+    const fn note_metadata(&mut self, level: MetadataLevel, flags: FrameFlags) {
         if flags.has(FrameFlags::METADATA_LOST) {
             self.metadata_lost += 1;
         } else {

@@ -3,10 +3,11 @@
 use super::mode::{check_all, invalid};
 use super::{
     About, ExternalAnswer, ExternalLock, ExternalMode, ExternalOffer, ExternalReason, ExternalState,
-    ExternalWant, HEARTBEAT, MAX_MODES, Mode, Place, SILENCE, VERSION, lock_camera, plain, text,
+    ExternalWant, HEARTBEAT, MAX_MODES, Mode, Place, SILENCE, VERSION, lock_camera, plain,
 };
 use crate::channel::{self, Inlet, IoxService, Outlet};
 use crate::sync::lock;
+use crate::text;
 use crate::{Bus, Error, ErrorKind, HostTime, Result};
 use core::sync::atomic::{AtomicBool, Ordering};
 use core::time::Duration;

@@ -3,9 +3,10 @@
 use super::mode::{check_all, check_count, invalid};
 use super::{
     About, ExternalAnswer, ExternalFrame, ExternalOffer, ExternalReason, ExternalState, ExternalWant,
-    MODE_BYTES, Mode, OFFER_MAGIC, Place, TEXT_BYTES, VERSION, plain, text,
+    MODE_BYTES, Mode, OFFER_MAGIC, Place, TEXT_BYTES, VERSION, plain,
 };
 use crate::channel::{self, Inlet, IoxService, Outlet, Received};
+use crate::text;
 use crate::{Bus, Error, ErrorKind, HostTime, Result, StreamName};
 use core::time::Duration;
 use iceoryx2::port::listener::Listener;

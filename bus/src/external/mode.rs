@@ -2,8 +2,8 @@
 
 use super::{
     ExternalClock, ExternalMode, ExternalModeFlags, ExternalOffer, MAX_FRAME_BYTES, MAX_MODES, MAX_STREAMS,
-    text,
 };
+use crate::text;
 use crate::{Distortion, Error, ErrorKind, Intrinsics, Layout, Name, PixelFormat, Pose, Result, StreamName};
 
 /// The longest side of an image, pixels.

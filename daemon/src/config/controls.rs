@@ -1,6 +1,6 @@
 //! Controls of a camera by name, as rig files give them: numbers, on or off, or the name of a menu's item.
 
-use super::read::{FromToml, Section};
+use super::read::{FromToml, Section, describe};
 use depthrig_usb::controls::ControlValue;
 use std::collections::BTreeMap;
 use toml::de::DeValue;
@@ -22,7 +22,10 @@ impl FromToml for ControlValue {
             DeValue::Integer(i) => i64::from_str_radix(i.as_str(), i.radix()).ok().map(Self::Integer),
             _ => None,
         };
-        read.ok_or_else(|| "must be a whole number, true, false, or the name of an item in quotes".to_owned())
+        read.ok_or_else(|| {
+            let is = describe(value);
+            format!("must be a whole number, true, false or the name of an item; it is {is}")
+        })
     }
 }
 

@@ -66,18 +66,11 @@ fn identify(d: &UsbDevice, all: &[UsbDevice]) -> Option<Identified> {
 
 fn read(r: &Reader<'_>) -> BackendConfig {
     let s = r.section;
-    let streams = r.streams;
-    for wanted in streams {
-        let name = wanted.request.stream.as_str();
-        if !STREAMS.contains(&name) {
-            let why = format!("a Kinect has no stream \"{name}\"; it has: {}", STREAMS.join(", "));
-            s.problem(wanted.at, why);
-        }
-    }
+    r.check_streams("a Kinect", &STREAMS);
     if s.has("recording") {
         return BackendConfig::new(recorded(s, r.base));
     }
-    BackendConfig::new(attached(s, r.base, streams))
+    BackendConfig::new(attached(s, r.base, r.streams))
 }
 
 /// A recording that plays: its device is not asked for anything.

@@ -39,7 +39,6 @@ fn identify(d: &UsbDevice, _: &[UsbDevice]) -> Option<Identified> {
 
 fn read(r: &Reader<'_>) -> L515Config {
     let s = r.section;
-    let streams = r.streams;
     let text = |key| s.or(key, None, |t: &Option<String>| controls::not_blank(t.as_deref()));
     let mut settings = L515Config {
         serial: text("serial"),
@@ -55,18 +54,8 @@ fn read(r: &Reader<'_>) -> L515Config {
         }
         settings.controls.insert(name, found.value);
     }
-    for wanted in streams {
-        let name = wanted.request.stream.as_str();
-        if !STREAMS.contains(&name) {
-            let why = format!("an L515 has no stream \"{name}\"; it has: {}", STREAMS.join(", "));
-            s.problem(wanted.at, why);
-        }
-    }
-    let asks_color = streams.is_empty() || streams.iter().any(|w| w.request.stream.as_str() == "color");
-    if !settings.color_controls.is_empty() && !asks_color {
-        let why = "is set, but color is not among the streams of its [[camera.stream]] tables";
-        s.problem(s.at_key("color_controls"), format!("{} {why}", s.key_of("color_controls")));
-    }
+    r.check_streams("an L515", &STREAMS);
+    r.check_color_controls(&settings.color_controls);
     settings
 }
 

@@ -57,7 +57,6 @@ fn identify(d: &UsbDevice, _: &[UsbDevice]) -> Option<Identified> {
 
 fn read(r: &Reader<'_>) -> RealsenseConfig {
     let s = r.section;
-    let streams = r.streams;
     let d = RealsenseConfig::default();
     let text = |key| s.or(key, None, |t: &Option<String>| controls::not_blank(t.as_deref()));
     let preset = s.or("preset", None, |p: &Option<PathBuf>| p.as_deref().map_or(Ok(()), not_empty));
@@ -87,18 +86,8 @@ fn read(r: &Reader<'_>) -> RealsenseConfig {
             }
         }
     }
-    for wanted in streams {
-        let name = wanted.request.stream.as_str();
-        if !STREAMS.contains(&name) {
-            let why = format!("a RealSense D400 has no stream \"{name}\"; it has: {}", STREAMS.join(", "));
-            s.problem(wanted.at, why);
-        }
-    }
-    let asks_color = streams.is_empty() || streams.iter().any(|w| w.request.stream.as_str() == "color");
-    if !config.color_controls.is_empty() && !asks_color {
-        let why = "is set, but color is not among the streams of its [[camera.stream]] tables";
-        s.problem(s.at_key("color_controls"), format!("{} {why}", s.key_of("color_controls")));
-    }
+    r.check_streams("a RealSense D400", &STREAMS);
+    r.check_color_controls(&config.color_controls);
     config
 }
 

@@ -3,12 +3,12 @@
 use super::{
     BackendConfig, CameraSettings, Family, Found, Identified, OpenContext, Probe, Selector, Source, is_video,
 };
+use crate::config::controls;
 use crate::config::read::{Located, Section};
 use crate::config::value::within;
 use depthrig_bus::{Distortion, Intrinsics, StreamName};
 use depthrig_driver::{Backend, Result};
 use depthrig_usb::UsbDevice;
-use depthrig_usb::controls::ControlValue;
 use depthrig_v4l2::{
     BUFFERS, ClockChoice, GivenIntrinsics, MemoryChoice, MjpegChoice, V4l2Backend, V4l2Config,
 };
@@ -41,7 +41,7 @@ fn read(s: &Section<'_, '_>) -> V4l2Config {
     V4l2Config {
         serial: text("serial"),
         port: text("port"),
-        controls: controls(s),
+        controls: controls::read(s, "controls", "[camera.controls]").into_iter().collect(),
         memory: s.choice("memory", &MEMORY, d.memory),
         mjpeg: s.choice("mjpeg", &MJPEG, d.mjpeg),
         clock: s.choice("clock", &CLOCK, d.clock),
@@ -62,35 +62,6 @@ fn read(s: &Section<'_, '_>) -> V4l2Config {
 
 fn probe(p: &Probe<'_>) -> Box<dyn Backend> {
     Box::new(V4l2Backend::new(V4l2Config { port: Some(p.port.to_owned()), ..V4l2Config::default() }))
-}
-
-/// The controls by name. Only the camera knows which names there are.
-fn controls(camera: &Section<'_, '_>) -> Vec<(String, ControlValue)> {
-    let entries = camera.entries::<Value>("controls", "[camera.controls]");
-    entries.into_iter().map(|(name, found)| (name, found.value.0)).collect()
-}
-
-/// A [`ControlValue`] out of a rig file.
-struct Value(ControlValue);
-
-impl crate::config::read::FromToml for Value {
-    fn from_toml(value: &toml::de::DeValue<'_>) -> core::result::Result<Self, String> {
-        use toml::de::DeValue;
-        Ok(Self(match value {
-            DeValue::Boolean(b) => ControlValue::Boolean(*b),
-            DeValue::String(item) => ControlValue::Item(item.to_string()),
-            DeValue::Integer(i) => match i64::from_str_radix(i.as_str(), i.radix()) {
-                Ok(i) => ControlValue::Integer(i),
-                Err(_) => return Err("must be a whole number of 64 bits".to_owned()),
-            },
-            other => {
-                let is = crate::config::read::describe(other);
-                return Err(format!(
-                    "must be a whole number, true, false or the name of an item; it is {is}"
-                ));
-            }
-        }))
-    }
 }
 
 const MODELS: [(&str, Distortion); 5] = [

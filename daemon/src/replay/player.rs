@@ -245,13 +245,7 @@ fn send(
     let mut books = stream.books();
     match &sent {
         Ok(Some(h)) => {
-            books.delivered += 1;
-            books.epoch = h.clock_epoch;
-            books.uncertainty_ns = h.capture_uncertainty_ns;
-            books.uncertain += u64::from(h.has(FrameFlags::TIME_UNCERTAIN));
-            books.note_metadata(h.metadata_level(), FrameFlags(h.flags));
-            let samples = if stream.profile.format.is_motion() { h.width } else { 1 };
-            books.note(HostTime::now(), h.publish_time_ns.saturating_sub(h.capture_time_ns), samples);
+            books.published(h, h.publish_time_ns.saturating_sub(h.capture_time_ns));
         }
         _ => books.dropped.add(DropReason::NoSlot, 1),
     }

@@ -365,9 +365,7 @@ fn publish_on(
     if books.session != session {
         return Err(None);
     }
-    header.stream = [0; 32];
-    let name = stream.id.stream.as_str().as_bytes();
-    header.stream[..name.len()].copy_from_slice(name);
+    header.set_stream(&stream.id.stream);
     header.sequence = books.delivered + 1;
     header.dropped = books.dropped.0;
     header.captured = header.sequence + books.dropped.total();
@@ -384,11 +382,6 @@ fn publish_on(
         return Err(Some(Skip::NoSlot));
     }
     books.captured += 1;
-    books.delivered += 1;
-    books.epoch = header.clock_epoch;
-    books.uncertainty_ns = header.capture_uncertainty_ns;
-    books.uncertain += u64::from(header.has(FrameFlags::TIME_UNCERTAIN));
-    books.note_metadata(header.metadata_level(), FrameFlags(header.flags));
-    books.note(HostTime::now(), published.saturating_sub(header.capture_time_ns), 1);
+    books.published(&header, published.saturating_sub(header.capture_time_ns));
     Ok(total)
 }

@@ -4,7 +4,7 @@
 //! the ways that it can, and the device's own record of the frames it sent. Then, in a test of the backend:
 //!
 //! ```no_run
-//! use crate::conformance::{self, Subject};
+//! use depthrig_sim::conformance::{self, Subject};
 //! # fn subject() -> Box<dyn Subject> { unimplemented!() }
 //! let report = conformance::run(subject().as_ref());
 //! // Every case is listed: passed, failed and why, or not applicable and why.

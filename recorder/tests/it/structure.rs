@@ -90,8 +90,14 @@ fn recorded() -> MemFs {
     for k in 0..SETS {
         r.push(set(&session(), k)).unwrap();
         settle(&r);
-        // So that an account comes after the set.
-        std::thread::sleep(std::time::Duration::from_millis(2));
+        // So that an account comes after the set, however late the writer's thread is woken.
+        let so_far = r.progress().bytes;
+        let mut looks = 0;
+        while r.progress().bytes == so_far {
+            looks += 1;
+            assert!(looks < 10_000, "no account is written: {:?}", r.progress());
+            std::thread::sleep(std::time::Duration::from_millis(1));
+        }
     }
     assert!(r.finish().unwrap().complete);
     fs
