@@ -4,7 +4,7 @@
     ENVIRONMENT/bin/python tests/python/without_cuda.py
 
 PyPI has PyTorch for x86-64 Linux only with CUDA, and the loader wants every library and every function of it when `torch`
-is imported. Each function of the replacement fails with "unknown error", so that PyTorch finds no GPU; only those that it
+is imported. Each function of the replacement fails with "no device", so that PyTorch finds no GPU; only those that it
 calls while it is loaded (`__cudaRegisterFatBinary`) do nothing.
 """
 
@@ -18,8 +18,8 @@ from pathlib import Path
 
 PREFIXES = ("libcu", "libnv", "libnccl", "cu", "nccl", "nvshmem", "NVSHMEM")
 """Of the names of CUDA's libraries, of their versions, and of their functions without a version."""
-UNKNOWN = 999
-"""`cudaErrorUnknown`."""
+NO_DEVICE = 100
+"""`cudaErrorNoDevice`."""
 
 
 def readelf(option: str, library: Path) -> list[list[str]]:
@@ -51,7 +51,7 @@ def main() -> int:
     if not wanted:
         return 0
     names = sorted(set().union(*stubs.values()))
-    source = "".join(f"long {name}(void) {{ return {0 if name.startswith('__') else UNKNOWN}; }}\n" for name in names)
+    source = "".join(f"long {name}(void) {{ return {0 if name.startswith('__') else NO_DEVICE}; }}\n" for name in names)
     script = "".join(f'{v} {{ global: {"; ".join(sorted(n))}; }};\n' for v, n in sorted(stubs.items()) if v)
     with tempfile.NamedTemporaryFile("w", suffix=".map") as versions:
         versions.write(script)
