@@ -30,6 +30,7 @@ demo: setup-build ## the mount of seven cameras with ten depth modes, without a 
 	tools/demo.sh $(ARGS)
 
 environments: $(VENV)/.stamp $(LEROBOT)/.stamp $(OAK)/.stamp $(READERS)/node_modules/.stamp ## the environments of Python and Node that tests need
+	tools/python.sh environments
 
 test: setup-test environments ## every test: Rust, Python, third-party readers, the virtual machine
 	@tools/onnxruntime.sh || true
@@ -97,16 +98,14 @@ setup-peers:
 	@tools/setup.sh build peers
 
 $(VENV)/.stamp: $(REQUIREMENTS) python/pyproject.toml
-	python3 -m venv $(VENV)
-	$(VENV)/bin/pip install --quiet $(addprefix --requirement ,$(REQUIREMENTS)) --editable ./python
+	tools/environment.sh $(VENV) python3 $(addprefix --requirement ,$(REQUIREMENTS)) --editable ./python
 	touch $@
 
 $(LEROBOT)/.stamp: tests/python/requirements-lerobot.txt tests/python/without_cuda.py
 	for python in python3.12 $$HOME/.pyenv/versions/3.12*/bin/python python3; do \
-		"$$python" -c 'import venv' 2>/dev/null && break; done && "$$python" -m venv --clear $(LEROBOT)
-	$(LEROBOT)/bin/pip install --quiet --no-deps --no-compile --no-cache-dir --requirement $<
+		"$$python" -c 'import venv' 2>/dev/null && break; done && \
+		tools/environment.sh $(LEROBOT) "$$python" --no-deps --no-cache-dir --requirement $<
 	$(LEROBOT)/bin/python tests/python/without_cuda.py
-	rm -rf $(LEROBOT)/lib/python3*/site-packages/torch/include
 	touch $@
 
 $(PEERS_VENV)/.stamp: $(PEERS)/requirements.txt
@@ -120,8 +119,7 @@ $(FEED)/.stamp: $(PEERS)/requirements-feed.txt python/pyproject.toml
 	touch $@
 
 $(OAK)/.stamp: python/requirements-oak.txt
-	python3 -m venv --clear $(OAK)
-	$(OAK)/bin/pip install --quiet --no-compile --no-cache-dir --requirement $<
+	tools/environment.sh $(OAK) python3 --no-cache-dir --requirement $<
 	touch $@
 
 $(READERS)/node_modules/.stamp: $(READERS)/package.json $(READERS)/package-lock.json

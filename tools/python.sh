@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Tests the Python package as users get it: builds the source archive, from it the wheel, and runs the tests.
 #
+#   tools/python.sh environments   the environments of the tests below
 #   tools/python.sh versions   types, then the wheel's tests on every Python from 3.9 on that this computer has
 #   tools/python.sh torch      the tests that need PyTorch, with that of .venv-lerobot; 77 when it is not there
 #   tools/python.sh oak        the OAK bridge with the vendor's SDK in .venv-oak: tests, and types against its stubs; 77
@@ -33,23 +34,38 @@ environment() { # NAME PYTHON REQUIREMENT...: an environment with these, created
     local wanted
     wanted="$("$python" -V) $* $(cat python/pyproject.toml python/requirements-test.txt)"
     if [ "$(cat "$folder/.stamp" 2>/dev/null)" != "$wanted" ]; then
-        "$python" -m venv --clear "$folder"
-        "$folder/bin/pip" install --quiet --disable-pip-version-check "$@"
+        tools/environment.sh "$folder" "$python" "$@"
         printf '%s\n' "$wanted" >"$folder/.stamp"
     fi
 }
 
-versions() {
-    local wanted=${DEPTHRIG_PYTHONS:-3.9 3.10 3.11 3.12 3.13 3.14} version python found=() failed=""
+pip=("$envs/tools/bin/python" -m pip --disable-pip-version-check)
+# The type checker, the build and the one pip, which need a newer Python than the package.
+tools() {
+    local version python
+    python=$(for version in 3.14 3.13 3.12 3.11; do interpreter "$version" && break; done)
+    environment tools "$python" pip==25.3 build==1.6.1 mypy==2.4.1 numpy==2.4.6 'iceoryx2==0.10.*'
+}
+
+found=()
+# Finds the Pythons and creates their environments.
+environments() {
+    local wanted=${DEPTHRIG_PYTHONS:-3.9 3.10 3.11 3.12 3.13 3.14} version
     for version in $wanted; do
         if interpreter "$version" >/dev/null; then found+=("$version"); fi
     done
     [ ${#found[@]} -gt 0 ] || { echo "no Python of $wanted was found" >&2; return 1; }
+    tools
+    for version in "${found[@]}"; do
+        environment "$version" "$(interpreter "$version")" --requirement python/requirements-test.txt \
+            'iceoryx2==0.10.*' 'numpy>=1.21'
+    done
     echo "found: ${found[*]}; not there: $(comm -23 <(tr ' ' '\n' <<<"$wanted" | sort) <(printf '%s\n' "${found[@]}" | sort) | tr '\n' ' ')"
+}
 
-    # The type checker and the build need a newer Python than the package.
-    python=$(for version in 3.14 3.13 3.12 3.11; do interpreter "$version" && break; done)
-    environment tools "$python" build==1.6.1 mypy==2.4.1 numpy==2.4.6 'iceoryx2==0.10.*'
+versions() {
+    local version failed=""
+    environments
     "$envs/tools/bin/mypy" --config-file python/pyproject.toml --cache-dir "$envs/mypy" python/src
     rm -rf "$envs/dist"
     "$envs/tools/bin/python" -m build --outdir "$envs/dist" python >"$envs/build.log" 2>&1 || { cat "$envs/build.log"; return 1; }
@@ -58,20 +74,30 @@ versions() {
     wheel=$(echo "$envs"/dist/depthrig-*-py3-none-any.whl)
     tar --list --file "$envs"/dist/depthrig-*.tar.gz --wildcards '*/src/depthrig/py.typed' >/dev/null
 
+    # Two at once: they wait more than they compute.
+    rm -f "$envs"/*.failed
     for version in "${found[@]}"; do
-        python=$(interpreter "$version")
-        environment "$version" "$python" --requirement python/requirements-test.txt 'iceoryx2==0.10.*' 'numpy>=1.21'
-        "$envs/$version/bin/pip" install --quiet --disable-pip-version-check --force-reinstall --no-deps "$wheel"
-        "$envs/$version/bin/pip" check
-        (cd / && "$envs/$version/bin/python" -c 'import depthrig, pathlib, sys
-folder = pathlib.Path(depthrig.__file__).parent
-assert "site-packages" in str(folder) and (folder / "py.typed").exists(), folder
-print("==", sys.version.split()[0], "from", folder.relative_to(sys.prefix))')
-        # Not from the folder python/, where the package lies as source.
-        (cd / && box "$envs/$version/bin/python" -m pytest --quiet --config-file "$root/python/pyproject.toml" \
-            --rootdir "$root/python" -p no:cacheprovider "$root/python/tests") || failed+=" $version"
+        [ "$(jobs -rp | wc -l)" -lt 2 ] || wait -n || true
+        (test_version "$version" "$wheel" || touch "$envs/$version.failed") >"$envs/$version.log" 2>&1 &
+    done
+    wait
+    for version in "${found[@]}"; do
+        cat "$envs/$version.log"
+        [ ! -e "$envs/$version.failed" ] || failed+=" $version"
     done
     [ -z "$failed" ] || { echo "failed on Python$failed" >&2; return 1; }
+}
+
+test_version() { # VERSION WHEEL: each line with &&, because this is called where errors do not end the script
+    local of=$envs/$1
+    "${pip[@]}" --python "$of" install --quiet --force-reinstall --no-deps "$2" && "${pip[@]}" --python "$of" check &&
+        # Not from the folder python/, where the package lies as source.
+        cd / && "$of/bin/python" -c 'import depthrig, pathlib, sys
+folder = pathlib.Path(depthrig.__file__).parent
+assert "site-packages" in str(folder) and (folder / "py.typed").exists(), folder
+print("==", sys.version.split()[0], "from", folder.relative_to(sys.prefix))' &&
+        box "$of/bin/python" -m pytest --quiet --config-file "$root/python/pyproject.toml" \
+            --rootdir "$root/python" -p no:cacheprovider "$root/python/tests"
 }
 
 torch() {
@@ -83,7 +109,8 @@ torch() {
     # Beside PyTorch's environment, not into it: that one is LeRobot's, version by version.
     if [ ! -e "$envs/beside-torch/.stamp" ] || [ python/requirements-torch.txt -nt "$envs/beside-torch/.stamp" ]; then
         rm -rf "$envs/beside-torch"
-        "$python" -m pip install --quiet --disable-pip-version-check --no-deps --target "$envs/beside-torch" \
+        tools
+        "${pip[@]}" --python "$python" install --quiet --no-deps --target "$envs/beside-torch" \
             --requirement python/requirements-torch.txt
         touch "$envs/beside-torch/.stamp"
     fi
@@ -105,9 +132,9 @@ oak() {
 }
 
 case ${1:-} in
-versions | torch | oak) "$1" ;;
+environments | versions | torch | oak) "$1" ;;
 *)
-    sed -n '2,10s/^# \{0,1\}//p' "$0" >&2
+    sed -n '2,11s/^# \{0,1\}//p' "$0" >&2
     exit 2
     ;;
 esac
