@@ -11,7 +11,7 @@ from pathlib import Path
 
 WORDS = [  # pattern, what to write
     (r"pictures?", "image, frame"),
-    (r"eyes?", "left/right image, left/right camera"),
+    (r"(?<!hand-)(?<!hand )eyes?(?!-in-hand|-to-hand|-hand)", "left/right image, left/right camera"),
     (r"motion units?|units? of motion|samples? of motion", "IMU, IMU sample"),
     (r"back ends?", "backend"),
     (r"patience|patient", "timeout, deadline"),

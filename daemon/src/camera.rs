@@ -7,13 +7,14 @@ use crate::status::CameraState;
 use crate::stream::Stream;
 use crate::wake::Wake;
 use depthrig_bus::sync::lock;
-use depthrig_bus::{Bus, HostTime, StreamId};
+use depthrig_bus::{Bus, HostTime, Pose, StreamId};
 use depthrig_driver::DeviceInfo;
 use depthrig_recorder::Computed;
 use depthrig_sim::synthetic::Drawing;
 use depthrig_stereo::{Descriptions, Notice, PREFIXES, SIDES};
 use std::sync::{Arc, Mutex, MutexGuard};
 
+mod calibration;
 mod open;
 mod supervisor;
 
@@ -42,6 +43,8 @@ pub struct State {
     pub message: Option<String>,
     /// The error behind the message, for whoever waits for the first opening.
     pub error: Option<Error>,
+    /// Pose of the camera on the mount: the rig file's until it was open, then that of its calibration, if it has one.
+    pub pose: Pose,
     /// The device's facts about itself, once it was open.
     pub info: Option<DeviceInfo>,
     /// Its streams, once it was open; they stay the same over reconnects.
@@ -66,6 +69,7 @@ impl Camera {
             since: HostTime::from_ns(0),
             message: None,
             error: None,
+            pose: config.pose,
             info: None,
             streams: Vec::new(),
             derived: Vec::new(),

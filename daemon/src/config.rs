@@ -25,10 +25,12 @@ pub use stereo::StereoConfig;
 
 use crate::family::{FAMILIES, Family};
 use depthrig_bus::{CameraName, Pose, RigName, StreamName};
+use depthrig_calibrate::file::{CalibratedCamera, Calibration};
 use depthrig_driver::{StreamProfile, StreamRequest};
 use depthrig_stereo::StereoOptions;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// The highest rate that a camera or the sets may have, Hz.
 pub const MAX_RATE_HZ: f64 = 1000.0;
@@ -57,6 +59,8 @@ pub struct RigConfig {
     pub supervisor: SupervisorConfig,
     /// Settings of depth refinement.
     pub cdm: CdmConfig,
+    /// Calibration of the mount, absolute: intrinsics and poses found with a board.
+    pub calibration: Option<PathBuf>,
     /// The cameras in the order of the file; at least one, names unique.
     pub cameras: Vec<CameraConfig>,
     /// The file's text.
@@ -159,6 +163,17 @@ pub struct CameraConfig {
     pub refine: Option<RefineConfig>,
     /// Its family and that family's settings.
     pub backend: BackendConfig,
+    /// Entries of the mount's calibration; empty until the rig starts.
+    pub calibration: Vec<Arc<CameraCalibration>>,
+}
+
+/// An entry of the mount's calibration.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CameraCalibration {
+    /// When it was made.
+    pub created: String,
+    /// The entry.
+    pub camera: CalibratedCamera,
 }
 
 impl CameraConfig {
@@ -270,6 +285,36 @@ impl RigConfig {
     /// The commented rig of the paper: its seven real cameras and their ten depth modes. It needs them to run.
     pub const fn paper_text() -> &'static str {
         include_str!("../paper_rig.toml")
+    }
+
+    /// Reads the mount's calibration, if the rig has one, into its cameras.
+    ///
+    /// # Errors
+    /// `NotFound`, `PermissionDenied` or `BadInput` for a file that cannot be read or is wrong, or that has none of the cameras.
+    pub fn read_calibration(&mut self) -> crate::Result<()> {
+        let Some(path) = &self.calibration else { return Ok(()) };
+        let shown = path.display();
+        let bad = |why: String| crate::Error::new(crate::ErrorKind::BadInput, format!("{shown}: {why}"));
+        let text = depthrig_bus::files::read_to_string(path, depthrig_bus::files::TEXT_MAX_BYTES)
+            .map_err(|e| ConfigError::unreadable(path, e))?;
+        let file = Calibration::from_toml(&text).map_err(|e| bad(e.to_string()))?;
+        let mut used = false;
+        for camera in &mut self.cameras {
+            let entries = file.of_camera(camera.name.as_str());
+            let entry = |entry: &CalibratedCamera| {
+                Arc::new(CameraCalibration { created: file.created.clone(), camera: entry.clone() })
+            };
+            camera.calibration = entries.map(entry).collect();
+            used |= !camera.calibration.is_empty();
+        }
+        if !used {
+            let names: Vec<&str> = file.cameras.iter().map(|c| c.name.as_str()).collect();
+            return Err(bad(format!(
+                "has none of the rig's cameras; it has {}; give both the same names",
+                names.join(", ")
+            )));
+        }
+        Ok(())
     }
 
     /// The camera `name`.

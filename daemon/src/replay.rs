@@ -317,6 +317,7 @@ fn recording_config(sources: &mut Sources) -> RigConfig {
         control: ControlConfig { tcp: None },
         supervisor: SupervisorConfig::default(),
         cdm: CdmConfig::default(),
+        calibration: None,
         cameras: Vec::new(),
         text: sources.session().rig_config.clone(),
         path: None,

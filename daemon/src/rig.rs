@@ -165,6 +165,7 @@ impl Rig {
         let lock = options.runtime.lock(&config.rig, &who)?;
         let bus = Bus::open(&options.runtime, &config.rig)?;
         bus.clean_dead();
+        config.read_calibration()?;
         prepare(&mut config, options)?;
         let intake = Arc::new(Intake::default());
         let refiners = options.refiners.clone();
@@ -431,7 +432,7 @@ impl Inner {
                     model: info.model.clone(),
                     serial: info.serial.clone(),
                     calibration,
-                    camera_pose: camera.config.pose,
+                    camera_pose: state.pose,
                     computed: camera.computed(&stream.id),
                 }
             }));

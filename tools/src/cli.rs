@@ -2,9 +2,9 @@
 
 use crate::args::Global;
 use crate::commands::{
-    bench, cameras, cat, cdm, compare, completions, config, demo, doctor, edit, eval, export, import, info,
-    install, man, merge, record, recover, replay, report, run, sessions, status, stereo, tap, top, trim,
-    verify, zed,
+    bench, calibrate, cameras, cat, cdm, compare, completions, config, demo, doctor, edit, eval, export,
+    import, info, install, man, merge, record, recover, replay, report, run, sessions, status, stereo, tap,
+    top, trim, verify, zed,
 };
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
@@ -43,6 +43,9 @@ pub enum Command {
     /// List attached cameras: model, serial number, port, speed, user, problems
     #[command(after_help = cameras::EXAMPLES)]
     Cameras(cameras::CamerasArgs),
+    /// Draw boards; calibrate intrinsics, poses on the mount and hand-eye
+    #[command(subcommand, after_help = calibrate::EXAMPLES)]
+    Calibrate(calibrate::CalibrateCommand),
     /// Check cameras, USB, permissions, memory and disk before a session
     #[command(after_help = doctor::EXAMPLES)]
     Doctor(doctor::DoctorArgs),

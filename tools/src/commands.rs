@@ -1,6 +1,7 @@
 //! One module per command.
 
 pub mod bench;
+pub mod calibrate;
 pub mod cameras;
 pub mod cat;
 pub mod cdm;
@@ -64,6 +65,7 @@ pub fn run(cli: Cli) -> Result<Exit> {
         Command::Cat(args) => cat::run(&args, &context),
         Command::Cdm(command) => cdm::run(&command, &context),
         Command::Zed(command) => zed::run(&command, &context),
+        Command::Calibrate(command) => calibrate::run(&command, &context),
         Command::Stereo(args) => stereo::run(&args),
         Command::Trim(args) => trim::run(&args, &context),
         Command::Merge(args) => merge::run(&args, &context),

@@ -5,6 +5,7 @@
 
 mod args;
 mod bench;
+mod calibrate;
 mod cli;
 mod commands;
 mod context;

@@ -1,6 +1,6 @@
 //! Opening a camera: its driver, its streams, its channels on the bus.
 
-use super::{Camera, Shared};
+use super::{Camera, Shared, calibration};
 use crate::Result;
 use crate::family::OpenContext;
 use crate::sink::BusSink;
@@ -36,10 +36,13 @@ pub(super) fn open_session(
         };
         backend.open(None).map_err(in_camera)?
     };
-    let info = device.info().clone();
+    let mut info = device.info().clone();
     let wanted = requests(camera, device.profiles());
     let stream = device.start(&wanted).map_err(in_camera)?;
-    let streams = adopt(camera, shared, stream.profiles(), &info).map_err(in_camera)?;
+    let mut profiles = stream.profiles().to_vec();
+    let pose = calibration::apply(&camera.config, &mut profiles, &mut info).map_err(in_camera)?;
+    camera.state().pose = pose;
+    let streams = adopt(camera, shared, &profiles, &info).map_err(in_camera)?;
     let mut ports = Vec::new();
     for s in streams {
         let mut header = FrameHeader::default();
@@ -49,7 +52,7 @@ pub(super) fn open_session(
         header.depth_unit_m = s.profile.depth_unit_m;
         header.device_tick_ns = s.profile.clock.tick_ns();
         header.intrinsics = s.profile.intrinsics;
-        header.pose = camera.config.pose.compose(&s.profile.pose_in_device);
+        header.pose = pose.compose(&s.profile.pose_in_device);
         let publisher = publisher_of(shared, &s).map_err(|e| {
             let kind = match e.kind() {
                 crate::ErrorKind::NoSpace => DriverErrorKind::Unsupported,

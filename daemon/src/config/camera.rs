@@ -54,7 +54,7 @@ pub(super) fn read(
     let name = name?.value;
     let backend = backend?;
     let streams = if streams.is_empty() { backend.default_streams() } else { streams };
-    Some(CameraConfig { name, pose, streams, record, stereo, refine, backend })
+    Some(CameraConfig { name, pose, streams, record, stereo, refine, backend, calibration: Vec::new() })
 }
 
 fn pose(camera: &Section<'_, '_>) -> Pose {

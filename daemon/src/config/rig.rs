@@ -43,6 +43,11 @@ pub(super) fn read(
     let base = base.or_else(|| std::env::current_dir().ok()).unwrap_or_default();
     let top = Section::top(report, document.get_ref());
     let rig = top.required::<RigName>("rig", "\"mount\"");
+    let calibration = top.or("calibration", None, |path: &Option<PathBuf>| match path {
+        Some(path) => not_empty(path),
+        None => Ok(()),
+    });
+    let calibration = calibration.map(|path| resolve(&base, &path));
     let bus = bus(&top);
     let sets = sets(&top);
     let recording = recording(&top, &base);
@@ -59,7 +64,19 @@ pub(super) fn read(
     for stereo in cameras.iter_mut().filter_map(|c| c.stereo.as_mut()) {
         stereo.library.clone_from(&cdm.library);
     }
-    Some(RigConfig { rig: rig?.value, bus, sets, recording, control, supervisor, cdm, cameras, text, path })
+    Some(RigConfig {
+        rig: rig?.value,
+        bus,
+        sets,
+        recording,
+        control,
+        supervisor,
+        cdm,
+        calibration,
+        cameras,
+        text,
+        path,
+    })
 }
 
 fn bus(top: &Section<'_, '_>) -> BusConfig {

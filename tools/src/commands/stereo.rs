@@ -71,7 +71,7 @@ pub fn preset(text: &str) -> Result<Preset, String> {
 }
 
 /// Rec. 709 luma. The crate `image` converts colour to grey differently from version to version; depth must not change.
-const fn luma([r, g, b]: [u32; 3]) -> u32 {
+pub const fn luma([r, g, b]: [u32; 3]) -> u32 {
     (2126 * r + 7152 * g + 722 * b) / 10_000
 }
 
