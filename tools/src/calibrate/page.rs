@@ -6,7 +6,7 @@ use depthrig_recorder::report::page::{self, END_TABLE, escape};
 use std::fmt::Write as _;
 
 /// Width of a map, pixels of the page.
-const MAP_WIDTH: f64 = 420.0;
+const MAP_WIDTH: f64 = 300.0;
 /// Uncertainty with the strongest colour, pixels.
 const STRONG_PX: f64 = 1.0;
 
@@ -26,6 +26,9 @@ pub fn page(file: &Calibration, result: &MountResult, refused: &[String], images
     );
     advice(&mut out, result, refused, board.measured_ruler_mm.is_none());
     cameras(&mut out, file);
+    if file.cameras.len() > 1 {
+        poses(&mut out, file);
+    }
     intrinsics(&mut out, file);
     for (camera, in_file) in result.cameras.iter().zip(&file.cameras) {
         maps(&mut out, camera, in_file);
@@ -74,19 +77,11 @@ fn cameras(out: &mut String, file: &Calibration) {
         "#factory px",
         "#projection ± px",
         "#halves differ px",
-        "#x mm",
-        "#y mm",
-        "#z mm",
-        "#place ± mm",
-        "#direction ± deg",
-        "#halves differ mm",
-        "#deg",
     ];
     out.push_str("<h2>Cameras</h2>");
     page::table(out, &columns);
     for camera in &file.cameras {
         let q = &camera.quality;
-        let [x, y, z] = camera.pose.translation_m.map(|t| format!("{:.2}", t * 1e3));
         let cells = [
             camera.name.clone(),
             if camera.source == FileSource::Factory { "factory" } else { "calibrated" }.to_owned(),
@@ -101,13 +96,6 @@ fn cameras(out: &mut String, file: &Calibration) {
                 number(Some(q.projection_worst_px), 2)
             ),
             number(q.halves_differ_px, 2),
-            x,
-            y,
-            z,
-            number(Some(camera.pose.sigma_mm), 3),
-            number(Some(camera.pose.sigma_deg), 4),
-            number(q.halves_differ_mm, 3),
-            number(q.halves_differ_deg, 4),
         ];
         page::row(out, &columns, &cells);
     }
@@ -118,6 +106,28 @@ fn cameras(out: &mut String, file: &Calibration) {
     );
 }
 
+fn poses(out: &mut String, file: &Calibration) {
+    let columns = ["camera", "#x mm", "#y mm", "#z mm", "#± mm", "#± deg", "#halves differ mm", "#deg"];
+    out.push_str("<h2>Poses on the mount</h2>");
+    page::table(out, &columns);
+    for camera in &file.cameras {
+        // The reference is at 0, not at -0.
+        let [x, y, z] = camera.pose.translation_m.map(|t| format!("{:.2}", t * 1e3 + 0.0));
+        let cells = [
+            camera.name.clone(),
+            x,
+            y,
+            z,
+            number(Some(camera.pose.sigma_mm), 3),
+            number(Some(camera.pose.sigma_deg), 4),
+            number(camera.quality.halves_differ_mm, 3),
+            number(camera.quality.halves_differ_deg, 4),
+        ];
+        page::row(out, &columns, &cells);
+    }
+    out.push_str(END_TABLE);
+}
+
 fn intrinsics(out: &mut String, file: &Calibration) {
     let columns = ["camera", "model", "#fx", "#fy", "#cx", "#cy", "coefficients"];
     out.push_str("<h2>Intrinsics</h2>");
@@ -125,14 +135,18 @@ fn intrinsics(out: &mut String, file: &Calibration) {
     for camera in &file.cameras {
         let k = &camera.intrinsics;
         let with_sigma = |i: usize, value: f64, digits: usize| match k.sigmas.get(i) {
-            Some(sigma) => format!("{value:.digits$} ± {sigma:.digits$}"),
+            Some(sigma) if *sigma > 0.0 => format!("{value:.digits$} ± {sigma:.digits$}"),
+            Some(_) => format!("{value:.digits$} (not estimated)"),
             None => format!("{value:.digits$}"),
         };
         let coefficients: Vec<String> =
             k.coeffs.iter().enumerate().map(|(i, c)| with_sigma(4 + i, *c, 5)).collect();
         let cells = [
             camera.name.clone(),
-            format!("{:?}", k.model),
+            serde_json::to_value(k.model)
+                .ok()
+                .and_then(|v| v.as_str().map(str::to_owned))
+                .unwrap_or_default(),
             with_sigma(0, k.fx, 3),
             with_sigma(1, k.fy, 3),
             with_sigma(2, k.cx, 3),
@@ -214,7 +228,7 @@ impl Map<'_> {
         let title = escape(&self.title);
         let _ = write!(
             out,
-            "<figure style=\"display:inline-block;margin:0 16px 16px 0;max-width:{MAP_WIDTH}px\"><svg role=\"img\" aria-label=\"{title}\" \
+            "<figure style=\"display:inline-block;vertical-align:top;margin:0 16px 16px 0;max-width:{MAP_WIDTH}px\"><svg shape-rendering=\"crispEdges\" role=\"img\" aria-label=\"{title}\" \
              width=\"{MAP_WIDTH}\" height=\"{:.0}\" viewBox=\"0 0 {MAP_WIDTH} {:.2}\" xmlns=\"http://www.w3.org/2000/svg\">",
             MAP_WIDTH * ratio,
             MAP_WIDTH * ratio
