@@ -205,3 +205,22 @@ def test_a_calibration_of_another_camera_is_refused(
         check=False,
     )
     assert message in done.stdout + done.stderr, done.stdout + done.stderr
+
+
+def test_a_camera_that_was_moved_is_found(binary: str, runtime: Path, tmp_path: Path) -> None:
+    board = chessboard(binary, runtime, tmp_path)
+    out = tmp_path / "stereo.toml"
+    images = sides(tmp_path)
+    command(binary, runtime, "calibrate", "solve", *images, "--board", str(board), "--out", str(out))
+    arguments = ("calibrate", "check", *images, "--calibration", str(out), "--json")
+    same = json.loads(command(binary, runtime, *arguments))
+    assert same["moved"] == [] and same["views"] == 13
+    # The right camera 3 mm further to the right than it is.
+    text = out.read_text()
+    place = tomllib.loads(text)["camera"][1]["pose"]["translation_m"]
+    x = repr(place[0])
+    out.write_text(text.replace(f"[{x},", f"[{place[0] + 3e-3!r},", 1))
+    assert tomllib.loads(out.read_text())["camera"][1]["pose"]["translation_m"][0] == pytest.approx(place[0] + 3e-3)
+    moved = json.loads(command(binary, runtime, *arguments, codes=(3,)))
+    assert moved["either"] and len(moved["moved"]) == 1
+    assert moved["moved"][0]["mm"] == pytest.approx(3.0, abs=0.3)

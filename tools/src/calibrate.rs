@@ -2,6 +2,7 @@
 
 pub mod dataset;
 pub mod images;
+pub mod input;
 pub mod page;
 
 use anyhow::{Context as _, Result, bail};
@@ -11,7 +12,7 @@ use depthrig_calib::Error;
 use depthrig_calibrate::adjustment::Corner;
 use depthrig_calibrate::board::Board;
 use depthrig_calibrate::detect::{Detection, Detector, GrayImage};
-use depthrig_calibrate::file::Provenance;
+use depthrig_calibrate::file::{Calibration, Provenance};
 use depthrig_calibrate::intrinsics::ImageSize;
 use depthrig_calibrate::rig::{RigView, Seen};
 use image::RgbImage;
@@ -90,14 +91,29 @@ pub struct Looked {
     pub refused: Option<String>,
 }
 
+/// A calibration is no longer than this, bytes.
+const CALIBRATION_MAX_BYTES: u64 = 4 << 20;
+
+/// Reads a calibration.
+///
+/// # Errors
+/// When it cannot be read or is wrong; the message names the file.
+pub fn calibration(path: &Path) -> Result<Calibration> {
+    let text = files::read(path, CALIBRATION_MAX_BYTES).with_context(|| {
+        format!("{}: cannot be read; `depthrig calibrate solve` writes one", path.display())
+    })?;
+    let text = String::from_utf8(text).with_context(|| format!("{}: is not text", path.display()))?;
+    Calibration::from_toml(&text).map_err(|e: Error| anyhow::anyhow!("{}: {e}", path.display()))
+}
+
 /// Refuses views of nothing.
 ///
 /// # Errors
 /// When no image shows the board.
-pub fn check(views: &Sightings, board: &Path) -> Result<()> {
+pub fn check(views: &Sightings) -> Result<()> {
     if views.views.is_empty() {
         let why = views.refused.first().map(|r| format!("; {r}")).unwrap_or_default();
-        bail!("none of {} images shows the board that {} describes{why}", views.images, board.display());
+        bail!("none of {} images shows the board as it is described{why}", views.images);
     }
     Ok(())
 }

@@ -6,6 +6,7 @@ use crate::intrinsics::ImageSize;
 use crate::mount::{CameraResult, MountResult, Source};
 use depthrig_bus::{Distortion, Intrinsics, Pose};
 use depthrig_calib::{Error, ErrorKind, Result};
+use nalgebra::{Matrix6, Vector6};
 use serde::{Deserialize, Serialize};
 
 #[cfg(test)]
@@ -105,6 +106,9 @@ pub struct FilePose {
     pub sigma_mm: f64,
     /// Standard deviation of the direction, degrees; 0 for the reference.
     pub sigma_deg: f64,
+    /// Covariance of the pose, six rows: rotations (radians) and places (metres) about and along the camera's axes.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub covariance: Vec<[f64; 6]>,
 }
 
 /// Measures of how good a camera's calibration is.
@@ -233,6 +237,9 @@ impl CalibratedCamera {
                 rotation_xyzw: pose.rotation_xyzw,
                 sigma_mm: camera.pose_sigma.metres * 1e3,
                 sigma_deg: camera.pose_sigma.radians.to_degrees(),
+                covariance: (0..6)
+                    .map(|i| core::array::from_fn(|j| camera.pose_covariance[(i, j)]))
+                    .collect(),
             },
             quality: Quality {
                 views: camera.views,
@@ -269,6 +276,18 @@ impl CalibratedCamera {
         Pose { translation_m: self.pose.translation_m, rotation_xyzw: self.pose.rotation_xyzw }
     }
 
+    /// Covariance of its pose, as [`crate::adjustment::Covariance::pose`] has it; from the standard deviations if the file has no
+    /// more.
+    pub fn pose_covariance(&self) -> Matrix6<f64> {
+        let rows = &self.pose.covariance;
+        if rows.len() == 6 {
+            return Matrix6::from_fn(|i, j| rows[i][j]);
+        }
+        let rotation = self.pose.sigma_deg.to_radians().powi(2) / 3.0;
+        let place = (self.pose.sigma_mm * 1e-3).powi(2) / 3.0;
+        Matrix6::from_diagonal(&Vector6::new(rotation, rotation, rotation, place, place, place))
+    }
+
     fn check(&self) -> Result<()> {
         let bad = |why: String| Err(Error::new(ErrorKind::BadInput, why));
         if self.name.is_empty() || self.stream.is_empty() || self.width == 0 || self.height == 0 {
@@ -281,6 +300,10 @@ impl CalibratedCamera {
         let length = self.pose.rotation_xyzw.iter().map(|c| c * c).sum::<f64>().sqrt();
         if length.is_nan() || (length - 1.0).abs() > 1e-3 {
             return bad(format!("rotation_xyzw has the length {length:.4}; a rotation has 1"));
+        }
+        let rows = &self.pose.covariance;
+        if !(rows.is_empty() || rows.len() == 6) || rows.iter().flatten().any(|c| !c.is_finite()) {
+            return bad("covariance has six rows of six finite numbers, or is left out".to_owned());
         }
         if self.pose.translation_m.iter().any(|t| !t.is_finite()) {
             return bad("translation_m is not finite".to_owned());

@@ -6,6 +6,7 @@
 pub mod adjustment;
 pub mod board;
 mod board_pose;
+pub mod check;
 pub mod detect;
 pub mod difference;
 pub mod file;

@@ -9,6 +9,7 @@ use crate::{Distance, Rigid, board_pose};
 use depthrig_bus::{Distortion, Intrinsics};
 use depthrig_calib::{Error, ErrorKind, Result};
 use glam::DVec2;
+use nalgebra::Matrix6;
 
 mod advice;
 mod coverage;
@@ -69,6 +70,8 @@ pub struct CameraResult {
     pub rig_from_camera: Rigid,
     /// Standard deviation of its place, metres, and of its direction, radians: the root of the sum over three axes.
     pub pose_sigma: Distance,
+    /// Its whole covariance, as [`crate::adjustment::Covariance::pose`] has it.
+    pub pose_covariance: Matrix6<f64>,
     /// Views that show the board.
     pub views: usize,
     /// Corners that were used.
@@ -336,6 +339,7 @@ fn camera_result(
         factory_px: chosen.factory_px,
         rig_from_camera: adjusted.camera_from_rig.inverse(),
         pose_sigma: Distance { metres: root(3), radians: root(0) },
+        pose_covariance: pose,
         views: own.len(),
         corners,
         outliers: found.fit.outliers.iter().filter(|o| own.contains(&o.sighting)).count(),

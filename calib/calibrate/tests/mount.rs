@@ -3,64 +3,12 @@
 
 mod common;
 
-use common::{Random, board_at, charuco, intrinsics, seen};
+use common::{Random, mount, mount_cameras, mount_views};
 use depthrig_calibrate::Rigid;
-use depthrig_calibrate::adjustment::INTRINSIC_PARAMETERS;
-use depthrig_calibrate::rig::{RigCamera, RigOptions, RigResult, RigView, Seen, calibrate_rig};
-use glam::{DQuat, DVec3};
-
-const NOISE_PX: f64 = 0.2;
-
-/// Seven cameras on an arc of 0.6 m, looking at a point 0.8 m ahead; the first one is the rig's frame.
-fn mount() -> Vec<Rigid> {
-    (0..7)
-        .map(|i| {
-            let x = f64::from(i) * 0.1;
-            let rotation =
-                DQuat::from_rotation_y(-0.1 * f64::from(i)) * DQuat::from_rotation_x(0.03 * f64::from(i % 3));
-            let at = DVec3::new(x, 0.02 * f64::from(i % 2), 0.0);
-            Rigid { rotation, translation: at }.inverse()
-        })
-        .collect()
-}
-
-fn views(truth: &[Rigid], count: usize, random: &mut Random) -> Vec<RigView> {
-    let board = charuco();
-    (0..count)
-        .map(|i| {
-            let middle =
-                DVec3::new(random.between(-0.1, 0.6), random.between(-0.15, 0.15), random.between(0.55, 1.0));
-            let tilt =
-                DVec3::new(random.between(-0.6, 0.6), random.between(-0.6, 0.6), random.between(-0.4, 0.4));
-            let rig_from_board = board_at(&board, middle, tilt);
-            let each = truth.iter().enumerate().map(|(camera, camera_from_rig)| Seen {
-                camera,
-                corners: seen(
-                    &board,
-                    &intrinsics(520.0),
-                    &camera_from_rig.after(&rig_from_board),
-                    NOISE_PX,
-                    random,
-                ),
-            });
-            RigView { name: i.to_string(), seen: each.filter(|s| s.corners.len() >= 12).collect() }
-        })
-        .filter(|v: &RigView| v.seen.len() >= 2)
-        .collect()
-}
-
-fn cameras(n: usize) -> Vec<RigCamera> {
-    (0..n)
-        .map(|i| RigCamera {
-            name: format!("cam{i}"),
-            intrinsics: intrinsics(520.0),
-            free_intrinsics: [false; INTRINSIC_PARAMETERS],
-        })
-        .collect()
-}
+use depthrig_calibrate::rig::{RigOptions, RigResult, calibrate_rig};
 
 fn calibrated(truth: &[Rigid], count: usize, random: &mut Random) -> RigResult {
-    calibrate_rig(&cameras(truth.len()), &views(truth, count, random), &RigOptions::default()).unwrap()
+    calibrate_rig(&mount_cameras(), &mount_views(truth, count, random), &RigOptions::default()).unwrap()
 }
 
 #[test]
@@ -107,13 +55,13 @@ fn poses_are_found_and_three_sigma_cover_the_truth() {
 #[test]
 fn cameras_that_share_no_view_are_named_in_their_groups() {
     let truth = mount();
-    let mut views = views(&truth, 12, &mut Random(1));
+    let mut views = mount_views(&truth, 12, &mut Random(1));
     // The board is never seen by one of the first three and one of the last four at once.
     for (i, view) in views.iter_mut().enumerate() {
         view.seen.retain(|s| (s.camera < 3) == (i % 2 == 0));
     }
     views.retain(|v| v.seen.len() >= 2);
-    let message = calibrate_rig(&cameras(7), &views, &RigOptions::default()).unwrap_err().to_string();
+    let message = calibrate_rig(&mount_cameras(), &views, &RigOptions::default()).unwrap_err().to_string();
     assert!(message.contains("[cam0, cam1, cam2] and [cam3, cam4, cam5, cam6]"), "{message}");
 }
 
@@ -121,7 +69,7 @@ fn cameras_that_share_no_view_are_named_in_their_groups() {
 fn a_camera_that_was_moved_during_the_capture_shows_in_the_outliers() {
     let truth = mount();
     let mut random = Random(5);
-    let mut all = views(&truth, 20, &mut random);
+    let mut all = mount_views(&truth, 20, &mut random);
     let mut wrong = 0;
     for view in all.iter_mut().take(2) {
         for corner in view.seen.iter_mut().filter(|s| s.camera == 3).flat_map(|s| &mut s.corners) {
@@ -130,7 +78,7 @@ fn a_camera_that_was_moved_during_the_capture_shows_in_the_outliers() {
         }
     }
     assert!(wrong > 50);
-    let found = calibrate_rig(&cameras(7), &all, &RigOptions::default()).unwrap();
+    let found = calibrate_rig(&mount_cameras(), &all, &RigOptions::default()).unwrap();
     assert!(found.fit.outliers.len() >= wrong * 9 / 10, "{} of {wrong}", found.fit.outliers.len());
     let error = found.cameras[3].camera_from_rig.distance(&truth[3]);
     assert!(error.metres < 0.5e-3, "{error:?}");
@@ -140,13 +88,13 @@ fn a_camera_that_was_moved_during_the_capture_shows_in_the_outliers() {
 fn corners_of_wrong_squares_are_left_out() {
     let truth = mount();
     let mut random = Random(9);
-    let mut all = views(&truth, 20, &mut random);
+    let mut all = mount_views(&truth, 20, &mut random);
     for view in &mut all {
         for seen in &mut view.seen {
             seen.corners[5].pixel += glam::DVec2::new(15.0, -8.0);
         }
     }
-    let found = calibrate_rig(&cameras(7), &all, &RigOptions::default()).unwrap();
+    let found = calibrate_rig(&mount_cameras(), &all, &RigOptions::default()).unwrap();
     let sightings: usize = all.iter().map(|v| v.seen.len()).sum();
     assert!(found.fit.outliers.len() >= sightings, "{} of {sightings}", found.fit.outliers.len());
     assert!(found.fit.outliers.len() <= sightings + 20);

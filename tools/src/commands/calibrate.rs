@@ -5,6 +5,7 @@ use crate::exit::Exit;
 use anyhow::Result;
 
 pub mod board;
+pub mod check;
 pub mod hand_eye;
 pub mod solve;
 
@@ -18,6 +19,7 @@ Examples:
   depthrig calibrate board --paper a3
   depthrig calibrate solve data/20261125_1015_board --board board.toml
   depthrig calibrate solve --images left=left_images --images right=right_images --board board.toml
+  depthrig calibrate check data/20261126_0900 --calibration calibration.toml
   depthrig calibrate hand-eye wrist=images --board board.toml --poses poses.csv --calibration calibration.toml";
 
 /// Subcommands of `depthrig calibrate`.
@@ -29,6 +31,9 @@ pub enum CalibrateCommand {
     /// Calibrate intrinsics and poses from a dataset or from folders of images
     #[command(after_help = solve::EXAMPLES)]
     Solve(solve::SolveArgs),
+    /// Check whether a camera has moved since the calibration
+    #[command(after_help = check::EXAMPLES)]
+    Check(check::CheckArgs),
     /// Find where a camera sits on a robot's hand or beside the robot
     #[command(after_help = hand_eye::EXAMPLES)]
     HandEye(hand_eye::HandEyeArgs),
@@ -39,6 +44,7 @@ pub fn run(command: &CalibrateCommand, context: &Context) -> Result<Exit> {
     match command {
         CalibrateCommand::Board(args) => board::run(args),
         CalibrateCommand::Solve(args) => solve::run(args, context),
+        CalibrateCommand::Check(args) => check::run(args, context),
         CalibrateCommand::HandEye(args) => hand_eye::run(args, context),
     }
 }

@@ -23,6 +23,7 @@ fn file() -> Calibration {
             rotation_xyzw: [0.0, 0.6, 0.0, 0.8],
             sigma_mm: 0.1,
             sigma_deg: 0.01,
+            covariance: Vec::new(),
         },
         quality: Quality {
             views: 20,

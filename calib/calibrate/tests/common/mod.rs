@@ -4,8 +4,9 @@
 use depthrig_bus::{Distortion, Intrinsics};
 use depthrig_calib::Camera;
 use depthrig_calibrate::Rigid;
-use depthrig_calibrate::adjustment::Corner;
+use depthrig_calibrate::adjustment::{Corner, INTRINSIC_PARAMETERS};
 use depthrig_calibrate::board::{Board, Pattern};
+use depthrig_calibrate::rig::{RigCamera, RigView, Seen};
 use glam::{DQuat, DVec2, DVec3};
 
 /// Random numbers that are the same on each run (`splitmix64`).
@@ -83,6 +84,59 @@ pub fn seen(
             let noise = DVec2::new(random.normal(), random.normal()) * sigma_px;
             let inside = pixel.x > 5.0 && pixel.y > 5.0 && pixel.x < 634.0 && pixel.y < 474.0;
             inside.then_some(Corner { point, pixel: pixel + noise })
+        })
+        .collect()
+}
+
+/// Noise of a corner's coordinate.
+pub const NOISE_PX: f64 = 0.2;
+
+/// Seven cameras on an arc of 0.6 m, looking at a point 0.8 m ahead; the first one is the rig's frame.
+pub fn mount() -> Vec<Rigid> {
+    (0..7)
+        .map(|i| {
+            let x = f64::from(i) * 0.1;
+            let rotation =
+                DQuat::from_rotation_y(-0.1 * f64::from(i)) * DQuat::from_rotation_x(0.03 * f64::from(i % 3));
+            let at = DVec3::new(x, 0.02 * f64::from(i % 2), 0.0);
+            Rigid { rotation, translation: at }.inverse()
+        })
+        .collect()
+}
+
+/// What the cameras of a mount see of a board at random places.
+pub fn mount_views(truth: &[Rigid], count: usize, random: &mut Random) -> Vec<RigView> {
+    let board = charuco();
+    (0..count)
+        .map(|i| {
+            let middle =
+                DVec3::new(random.between(-0.1, 0.6), random.between(-0.15, 0.15), random.between(0.55, 1.0));
+            let tilt =
+                DVec3::new(random.between(-0.6, 0.6), random.between(-0.6, 0.6), random.between(-0.4, 0.4));
+            let rig_from_board = board_at(&board, middle, tilt);
+            let each = truth.iter().enumerate().map(|(camera, camera_from_rig)| Seen {
+                camera,
+                corners: seen(
+                    &board,
+                    &intrinsics(520.0),
+                    &camera_from_rig.after(&rig_from_board),
+                    NOISE_PX,
+                    random,
+                ),
+            });
+            RigView { name: i.to_string(), seen: each.filter(|s| s.corners.len() >= 12).collect() }
+        })
+        .filter(|v: &RigView| v.seen.len() >= 2)
+        .collect()
+}
+
+/// The cameras of [`mount`].
+pub fn mount_cameras() -> Vec<RigCamera> {
+    (0..7)
+        .map(|i| RigCamera {
+            name: format!("cam{i}"),
+            intrinsics: intrinsics(520.0),
+            free_intrinsics: [false; INTRINSIC_PARAMETERS],
         })
         .collect()
 }

@@ -9,7 +9,7 @@ use crate::progress::Progress;
 use crate::signals::Stop;
 use anyhow::{Context as _, Result, bail};
 use depthrig_bus::{Pose, files};
-use depthrig_calibrate::file::{CalibratedCamera, Calibration};
+use depthrig_calibrate::file::CalibratedCamera;
 use depthrig_calibrate::hand_eye::{Arrangement, HandEye, HandEyeView, Noise, hand_eye};
 use depthrig_calibrate::{Distance, Rigid};
 use glam::{DQuat, DVec3};
@@ -64,8 +64,6 @@ pub struct HandEyeArgs {
 
 /// A file of poses is no longer than this, bytes.
 const POSES_MAX_BYTES: u64 = 16 << 20;
-/// A calibration is no longer than this, bytes.
-const CALIBRATION_MAX_BYTES: u64 = 4 << 20;
 
 /// Reads, estimates and prints.
 pub fn run(args: &HandEyeArgs, context: &Context) -> Result<Exit> {
@@ -85,7 +83,7 @@ pub fn run(args: &HandEyeArgs, context: &Context) -> Result<Exit> {
     })?;
     bar.clear();
     let Some(views) = views else { bail!("interrupted") };
-    calibrate::check(&views, &args.board)?;
+    calibrate::check(&views)?;
     let size = views.cameras[0].size;
     if size != camera.size() {
         bail!(
@@ -131,8 +129,7 @@ fn text(path: &Path, limit: u64) -> Result<String> {
 }
 
 fn camera(path: &Path, name: &str) -> Result<CalibratedCamera> {
-    let calibration = Calibration::from_toml(&text(path, CALIBRATION_MAX_BYTES)?)
-        .map_err(|e| anyhow::anyhow!("{}: {e}", path.display()))?;
+    let calibration = calibrate::calibration(path)?;
     let found = calibration.of_camera(name).next().cloned();
     found.with_context(|| {
         let all: Vec<&str> = calibration.cameras.iter().map(|c| c.name.as_str()).collect();

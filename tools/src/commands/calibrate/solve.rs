@@ -1,16 +1,13 @@
 //! `depthrig calibrate solve`: intrinsics and poses from views of a board.
 
-use crate::calibrate::dataset::{self, DatasetOptions};
-use crate::calibrate::images::{self, Folder};
+use crate::calibrate::input::Input;
 use crate::calibrate::{self, Sightings, page};
 use crate::context::Context;
 use crate::exit::{Exit, UsageError};
 use crate::out;
 use crate::outfile::{OutFile, Overwrite};
-use crate::progress::Progress;
-use crate::signals::Stop;
-use anyhow::{Result, bail};
-use depthrig_bus::{Distortion, StreamId};
+use anyhow::Result;
+use depthrig_bus::Distortion;
 use depthrig_calibrate::board::Board;
 use depthrig_calibrate::file::Calibration;
 use depthrig_calibrate::mount::{CameraInput, MountOptions, MountResult, Source, calibrate_mount, usable};
@@ -38,17 +35,11 @@ Examples:
 #[derive(Debug, clap::Args)]
 #[allow(clippy::struct_excessive_bools)] // options of a command line
 pub struct SolveArgs {
-    /// Dataset that shows the board
-    dataset: Option<PathBuf>,
-    /// Images of one camera; repeatable
-    #[arg(long, value_name = "NAME=FOLDER", value_parser = images::folder, conflicts_with = "dataset")]
-    images: Vec<Folder>,
+    #[command(flatten)]
+    input: Input,
     /// Description of the board
     #[arg(long, value_name = "FILE", default_value = "board.toml")]
     board: PathBuf,
-    /// Stream of a camera to look at; repeatable [default: color, else left or infrared]
-    #[arg(long, value_name = "CAMERA/STREAM", requires = "dataset")]
-    stream: Vec<StreamId>,
     /// Camera whose frame is the mount's [default: the first]
     #[arg(long, value_name = "CAMERA")]
     reference: Option<String>,
@@ -61,9 +52,6 @@ pub struct SolveArgs {
     /// Estimate how far the board is from flat
     #[arg(long)]
     board_warp: bool,
-    /// Take every set of a dataset, those in which the board moves too
-    #[arg(long, requires = "dataset")]
-    moving: bool,
     /// Name of the operator, for the file
     #[arg(long, value_name = "NAME")]
     by: Option<String>,
@@ -96,25 +84,7 @@ pub fn run(args: &SolveArgs, context: &Context) -> Result<Exit> {
     let file = OutFile::new(&args.out, args.overwrite, &inputs)?;
     let report = args.report.clone().unwrap_or_else(|| args.out.with_extension("html"));
     let report = OutFile::new(&report, args.overwrite, &inputs)?;
-    let stop = Stop::on_signals()?;
-    let mut bar = Progress::new(context.global.quiet > 0);
-    let progress = |done, total| {
-        bar.set("looking for the board", done, total);
-        !stop.is_asked()
-    };
-    let views = match &args.dataset {
-        Some(path) => {
-            let options = DatasetOptions { streams: args.stream.clone(), moving: args.moving };
-            dataset::read(path, &board, &options, progress)?
-        }
-        None if args.images.is_empty() => {
-            return Err(UsageError("give a dataset, or --images NAME=FOLDER for each camera".into()).into());
-        }
-        None => images::read(&args.images, &board, progress)?,
-    };
-    bar.clear();
-    let Some(mut views) = views else { bail!("interrupted; nothing was written") };
-    calibrate::check(&views, &args.board)?;
+    let mut views = args.input.read(&board, context)?;
     refer_to(&mut views, args.reference.as_deref())?;
     let cameras: Vec<CameraInput> = views
         .cameras
