@@ -5,8 +5,10 @@ use crate::{Camera, Error, ErrorKind, PoseExt, Result};
 use depthrig_bus::{Intrinsics, Pose};
 use glam::DVec2;
 
+mod agreement;
 mod files;
 
+pub use agreement::{Agreement, DepthView, agreement};
 pub use files::{write_pcd, write_ply};
 
 /// Turns depth into points. The rays are computed once; a frame into a cloud that was used before allocates nothing.

@@ -17,7 +17,7 @@ pub mod stereo;
 mod undistort;
 
 pub use camera::{Camera, CameraExt, Projection, Ray};
-pub use cloud::{Deprojection, PointCloud, write_pcd, write_ply};
+pub use cloud::{Agreement, Deprojection, DepthView, PointCloud, agreement, write_pcd, write_ply};
 pub use error::{Error, ErrorKind, Result};
 pub use pose::PoseExt;
 pub use rectify::{Rectifier, RowCorrector, View};

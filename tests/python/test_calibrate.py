@@ -224,3 +224,55 @@ def test_a_camera_that_was_moved_is_found(binary: str, runtime: Path, tmp_path: 
     moved = json.loads(command(binary, runtime, *arguments, codes=(3,)))
     assert moved["either"] and len(moved["moved"]) == 1
     assert moved["moved"][0]["mm"] == pytest.approx(3.0, abs=0.3)
+
+
+TWO = """
+rig = "two"
+[recording]
+reserve_mb = 64
+[[camera]]
+name = "a"
+backend = "synthetic"
+model = "d435"
+[[camera]]
+name = "b"
+backend = "synthetic"
+model = "d435"
+pose = { translation_m = [0.08, 0.0, 0.0] }
+"""
+
+
+def test_a_cloud_shows_whether_a_calibration_is_right(binary: str, runtime: Path, tmp_path: Path) -> None:
+    rig = tmp_path / "rig.toml"
+    rig.write_text(TWO)
+    command(binary, runtime, "run", str(rig), "--record", str(tmp_path / "out"), "--seconds", "1")
+    (dataset,) = (p.parent for p in (tmp_path / "out").rglob("session.toml"))
+    ply = tmp_path / "cloud.ply"
+    right = json.loads(command(binary, runtime, "cloud", str(dataset), "--out", str(ply), "--json"))
+    assert {(p["points_of"], p["against"]) for p in right["pairs"]} == {("a", "b"), ("b", "a")}
+    # The cameras' own noise: there is no bias between them.
+    assert all(abs(p["median_mm"]) < 1.0 and p["median_abs_mm"] < 8.0 for p in right["pairs"]), right["pairs"]
+    header, _, body = ply.read_bytes().partition(b"end_header\n")
+    assert f"element vertex {right['points']}".encode() in header
+    assert len(body) == right["points"] * 15
+    # The second camera 30 mm ahead of where it is.
+    head, entry = CALIBRATION.split("[[camera]]")
+    text = head
+    for stream in tomllib.loads((dataset / "session.toml").read_text())["streams"]:
+        name, _, of = stream["id"].partition("/")
+        if of == "color":
+            x, y, z = stream["pose"]["translation_m"]
+            place = [x, y, z + (0.03 if name == "b" else 0.0)]
+            rotation = stream["pose"]["rotation_xyzw"]
+            text += "[[camera]]" + entry.format(serial="", width=stream["width"]).replace('name = "cam"', f'name = "{name}"').replace(
+                "height = 480", f"height = {stream['height']}"
+            ).replace("[0.1, 0.2, 0.3]", str(place)).replace("[0.0, 0.0, 1.0, 0.0]", str(rotation))
+    text = text.replace('source = "calibrated"', 'source = "factory"')
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text(text)
+    arguments = ("cloud", str(dataset), "--calibration", str(wrong), "--out", str(tmp_path / "wrong.ply"), "--json")
+    moved = json.loads(command(binary, runtime, *arguments))
+    by_pair = {(p["points_of"], p["against"]): p["median_mm"] for p in moved["pairs"]}
+    # Along the axis 30 mm on what it sees head-on, less on a slanted table.
+    assert 15.0 < by_pair["a", "b"] < 35.0
+    assert -35.0 < by_pair["b", "a"] < -15.0

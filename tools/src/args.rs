@@ -91,6 +91,30 @@ pub fn range_limit_m(text: &str) -> Result<f64, String> {
     number_within(text, "m", 1e-3..=1e6)
 }
 
+/// Parses a length on paper or an uncertainty, millimetres.
+///
+/// # Errors
+/// When `text` is out of range 0.001..=10000.
+pub fn length_mm(text: &str) -> Result<f64, String> {
+    number_within(text, "mm", 1e-3..=1e4)
+}
+
+/// Parses an uncertainty of an angle, degrees.
+///
+/// # Errors
+/// When `text` is out of range 0.0001..=45.
+pub fn angle_deg(text: &str) -> Result<f64, String> {
+    number_within(text, "degrees", 1e-4..=45.0)
+}
+
+/// Parses an uncertainty of a place in an image, pixels.
+///
+/// # Errors
+/// When `text` is out of range 0.001..=100.
+pub fn pixels(text: &str) -> Result<f64, String> {
+    number_within(text, "px", 1e-3..=100.0)
+}
+
 /// Parses a rate of frames, sets or pairs, Hz.
 ///
 /// # Errors

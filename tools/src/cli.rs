@@ -2,9 +2,9 @@
 
 use crate::args::Global;
 use crate::commands::{
-    bench, calibrate, cameras, cat, cdm, compare, completions, config, demo, doctor, edit, eval, export,
-    import, info, install, man, merge, record, recover, replay, report, run, sessions, status, stereo, tap,
-    top, trim, verify, zed,
+    bench, calibrate, cameras, cat, cdm, cloud, compare, completions, config, demo, doctor, edit, eval,
+    export, import, info, install, man, merge, record, recover, replay, report, run, sessions, status,
+    stereo, tap, top, trim, verify, zed,
 };
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
@@ -46,6 +46,9 @@ pub enum Command {
     /// Draw boards; calibrate intrinsics, poses on the mount and hand-eye
     #[command(subcommand, after_help = calibrate::EXAMPLES)]
     Calibrate(calibrate::CalibrateCommand),
+    /// Write the point cloud of all cameras at one moment, and compare their surfaces
+    #[command(after_help = cloud::EXAMPLES)]
+    Cloud(cloud::CloudArgs),
     /// Check cameras, USB, permissions, memory and disk before a session
     #[command(after_help = doctor::EXAMPLES)]
     Doctor(doctor::DoctorArgs),

@@ -5,6 +5,7 @@ pub mod calibrate;
 pub mod cameras;
 pub mod cat;
 pub mod cdm;
+pub mod cloud;
 pub mod compare;
 pub mod completions;
 pub mod config;
@@ -66,6 +67,7 @@ pub fn run(cli: Cli) -> Result<Exit> {
         Command::Cdm(command) => cdm::run(&command, &context),
         Command::Zed(command) => zed::run(&command, &context),
         Command::Calibrate(command) => calibrate::run(&command, &context),
+        Command::Cloud(args) => cloud::run(&args),
         Command::Stereo(args) => stereo::run(&args),
         Command::Trim(args) => trim::run(&args, &context),
         Command::Merge(args) => merge::run(&args, &context),

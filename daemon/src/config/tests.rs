@@ -473,7 +473,7 @@ fn each_problem_has_its_place_and_says_what_to_write() {
         (camera("  modle = \"d405\""), "rig.toml:5:3: unknown key \"modle\" in [[camera]] \"d435\"; did you mean \"model\"?"),
         (camera("rate_hz = 5"), "5:1: unknown key \"rate_hz\" in [[camera]] \"d435\"; it belongs to [camera.refine]"),
         (top("set = {}"), "1:1: unknown key \"set\" at the top of the file; did you mean \"sets\"?"),
-        (top("xyz = 1"), "1:1: unknown key \"xyz\" at the top of the file; it has: rig, bus, sets"),
+        (top("xyz = 1"), "1:1: unknown key \"xyz\" at the top of the file; it has: rig, calibration, bus, sets"),
         (camera("clock = { drift = 3 }"), "5:11: unknown key \"drift\" in [camera.clock] of camera \"d435\"; did you mean \"drift_ppm\"?"),
         (camera("seed = \"1\""), "5:8: \"seed\" in [[camera]] \"d435\" must be a whole number; it is the string \"1\""),
         (camera("seed = -1"), "5:8: \"seed\" in [[camera]] \"d435\" must be a whole number within 0..="),

@@ -127,9 +127,10 @@ fn list(folder: &Path) -> Result<Vec<PathBuf>> {
 fn number(path: &Path) -> Option<u64> {
     let name = path.file_stem()?.to_str()?;
     let end = name.rfind(|c: char| c.is_ascii_digit())? + 1;
-    let start = name[..end].rfind(|c: char| !c.is_ascii_digit()).map_or(0, |i| i + 1);
     // A character before the number may have several bytes.
-    name.get(start..end)?.parse().ok()
+    let before = name[..end].char_indices().rev().find(|(_, c)| !c.is_ascii_digit());
+    let start = before.map_or(0, |(at, c)| at + c.len_utf8());
+    name[start..end].parse().ok()
 }
 
 /// Images of one moment.

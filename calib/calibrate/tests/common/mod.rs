@@ -104,7 +104,7 @@ pub fn mount() -> Vec<Rigid> {
         .collect()
 }
 
-/// What the cameras of a mount see of a board at random places.
+/// Corners that the cameras of a mount see of a board at random places.
 pub fn mount_views(truth: &[Rigid], count: usize, random: &mut Random) -> Vec<RigView> {
     let board = charuco();
     (0..count)

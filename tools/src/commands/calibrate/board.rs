@@ -32,7 +32,7 @@ pub struct BoardArgs {
     #[arg(long, value_name = "N", default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..=100))]
     rows: u32,
     /// Side of a square or tag, millimetres [default: the largest that fits]
-    #[arg(long, value_name = "MM")]
+    #[arg(long, value_name = "MM", value_parser = crate::args::length_mm)]
     square_mm: Option<f64>,
     /// Paper: a4, a3, a2, a1, a0, letter, tabloid or WIDTHxHEIGHT in millimetres
     #[arg(long, value_name = "SIZE", default_value = "a4", value_parser = paper)]

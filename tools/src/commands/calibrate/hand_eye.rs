@@ -3,7 +3,7 @@
 use crate::calibrate;
 use crate::calibrate::images::{self, Folder};
 use crate::context::Context;
-use crate::exit::{Exit, UsageError};
+use crate::exit::Exit;
 use crate::out;
 use crate::progress::Progress;
 use crate::signals::Stop;
@@ -49,13 +49,13 @@ pub struct HandEyeArgs {
     #[arg(long)]
     eye_to_hand: bool,
     /// Standard deviation of the robot's position, millimetres
-    #[arg(long, value_name = "MM", default_value_t = 0.2)]
+    #[arg(long, value_name = "MM", default_value_t = 0.2, value_parser = crate::args::length_mm)]
     robot_mm: f64,
     /// Standard deviation of the robot's orientation, degrees
-    #[arg(long, value_name = "DEG", default_value_t = 0.05)]
+    #[arg(long, value_name = "DEG", default_value_t = 0.05, value_parser = crate::args::angle_deg)]
     robot_deg: f64,
     /// Standard deviation of a corner, pixels
-    #[arg(long, value_name = "PX", default_value_t = 0.2)]
+    #[arg(long, value_name = "PX", default_value_t = 0.2, value_parser = crate::args::pixels)]
     corner_px: f64,
     /// Print JSON
     #[arg(long)]
@@ -67,10 +67,6 @@ const POSES_MAX_BYTES: u64 = 16 << 20;
 
 /// Reads, estimates and prints.
 pub fn run(args: &HandEyeArgs, context: &Context) -> Result<Exit> {
-    if !(args.robot_mm > 0.0 && args.robot_deg > 0.0 && args.corner_px > 0.0) {
-        let text = "--robot-mm, --robot-deg and --corner-px are standard deviations above 0";
-        return Err(UsageError(text.into()).into());
-    }
     let board = calibrate::board(&args.board)?;
     let poses = poses(&text(&args.poses, POSES_MAX_BYTES)?)
         .with_context(|| format!("{}: invalid poses", args.poses.display()))?;

@@ -1,0 +1,349 @@
+//! `depthrig cloud`: the point cloud of all cameras at one moment, and how well their surfaces agree.
+
+use crate::calibrate;
+use crate::exit::Exit;
+use crate::outfile::{OutFile, Overwrite};
+use crate::{image_file, out};
+use anyhow::{Context as _, Result, bail};
+use depthrig_bus::{FrameHeader, Intrinsics, PixelFormat, Pose};
+use depthrig_calib::{
+    Deprojection, DepthView, PointCloud, PoseExt, Registration, agreement, same_view, write_ply,
+};
+use depthrig_calibrate::file::{Calibration, FileSource};
+use depthrig_recorder::{Dataset, DatasetFrame, DatasetSet, Edge, PixelMode, SetSpan};
+use serde::Serialize;
+use std::path::PathBuf;
+
+/// Examples for `--help`.
+pub const EXAMPLES: &str = "\
+Depth of each camera as it was recorded, in the mount's coordinates, coloured. The table has for each pair of cameras the median difference of depth on
+surfaces that both see: a good calibration shows the depth's own errors there, a bad one more. --calibration puts another calibration's poses
+and intrinsics in place of the recorded ones; --by-camera gives each camera a colour of its own, which shows seams.
+
+Exit codes: 0 written, 1 failure, 2 wrong usage.
+
+Examples:
+  depthrig cloud data/20261125_1015_kitchen --out kitchen.ply
+  depthrig cloud data/20261125_1015_kitchen --set 40 --depth depth_refined --calibration calibration.toml --out after.ply";
+
+/// Arguments.
+#[derive(Debug, clap::Args)]
+pub struct CloudArgs {
+    /// Dataset folder, or one segment file
+    dataset: PathBuf,
+    /// Set to show [default: the middle one]
+    #[arg(long, value_name = "ID")]
+    set: Option<u64>,
+    /// Depth stream to show [default: depth_refined, else depth, else the first mode]
+    #[arg(long, value_name = "STREAM")]
+    depth: Option<String>,
+    /// Calibration whose poses and intrinsics replace the recorded ones
+    #[arg(long, value_name = "FILE")]
+    calibration: Option<PathBuf>,
+    /// Leave out points further away than this, metres
+    #[arg(long, value_name = "M", default_value_t = 5.0, value_parser = crate::args::range_limit_m)]
+    max_m: f64,
+    /// Colour the points by camera
+    #[arg(long)]
+    by_camera: bool,
+    /// Point cloud to write (PLY)
+    #[arg(long, value_name = "FILE", default_value = "cloud.ply")]
+    out: PathBuf,
+    #[command(flatten)]
+    overwrite: Overwrite,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Colours of cameras that colour-blind people distinguish, too (Okabe and Ito).
+const COLORS: [[u8; 3]; 7] = [
+    [230, 159, 0],
+    [86, 180, 233],
+    [0, 158, 115],
+    [240, 228, 66],
+    [0, 114, 178],
+    [213, 94, 0],
+    [204, 121, 167],
+];
+/// A point without colour.
+const GREY: [u8; 3] = [160, 160, 160];
+
+/// Reads, joins, compares and writes.
+pub fn run(args: &CloudArgs) -> Result<Exit> {
+    let dataset = Dataset::open(&args.dataset)?;
+    let calibration = args.calibration.as_deref().map(calibrate::calibration).transpose()?;
+    let file = OutFile::new(&args.out, args.overwrite, &[])?;
+    let set = set(&dataset, args.set)?;
+    let mut views = Vec::new();
+    let mut cameras: Vec<String> = Vec::new();
+    for record in &dataset.session().streams {
+        let name = record.id.camera.to_string();
+        if !cameras.contains(&name) {
+            cameras.push(name);
+        }
+    }
+    for name in &cameras {
+        views.extend(View::new(&dataset, &set, name, args, calibration.as_ref(), views.len())?);
+    }
+    if views.is_empty() {
+        bail!(
+            "set {} of {}: has no depth{}",
+            set.id,
+            args.dataset.display(),
+            args.depth.as_ref().map_or_else(String::new, |d| format!(" '{d}'"))
+        );
+    }
+    let mut all = PointCloud::default();
+    for view in &views {
+        all.points.extend(&view.cloud.points);
+        all.colors.extend(&view.cloud.colors);
+    }
+    let mut bytes = Vec::new();
+    write_ply(&all, &mut bytes)?;
+    file.write(&bytes)?;
+    let report = Report {
+        set: set.id,
+        points: all.points.len(),
+        pairs: pairs(&views)?,
+        cameras: views.iter().map(View::line).collect(),
+    };
+    if args.json {
+        out::json(&report)?;
+    } else {
+        out::line(report.text())?;
+        out::line(format_args!("written   {}", file.path().display()))?;
+    }
+    Ok(Exit::Good)
+}
+
+fn set(dataset: &Dataset, id: Option<u64>) -> Result<DatasetSet> {
+    let mut reader = dataset.set_reader()?;
+    let number = match id {
+        Some(id) => {
+            SetSpan { from: Some(Edge::Set(id)), to: Some(Edge::Set(id)) }.numbers(&mut reader)?.start
+        }
+        None => reader.times().len() / 2,
+    };
+    Ok(reader.read(number, PixelMode::Stored)?)
+}
+
+/// A camera's depth in the mount's coordinates.
+struct View {
+    name: String,
+    stream: String,
+    depth_m: Vec<f32>,
+    size: (u32, u32),
+    intrinsics: Intrinsics,
+    pose: Pose,
+    cloud: PointCloud,
+}
+
+impl View {
+    /// `None` for a camera without the depth asked for.
+    fn new(
+        dataset: &Dataset,
+        set: &DatasetSet,
+        name: &str,
+        args: &CloudArgs,
+        calibration: Option<&Calibration>,
+        index: usize,
+    ) -> Result<Option<Self>> {
+        let streams = &dataset.session().streams;
+        let of_camera: Vec<&DatasetFrame> = set
+            .frames
+            .iter()
+            .filter(|f| streams.get(f.stream).is_some_and(|s| s.id.camera.as_str() == name))
+            .collect();
+        let named = |stream: &str| of_camera.iter().find(|f| f.header.stream() == stream).copied();
+        let is_depth = |f: &&&DatasetFrame| f.header.pixel_format().is_some_and(PixelFormat::is_depth);
+        let frame = match &args.depth {
+            Some(stream) => named(stream),
+            None => named("depth_refined")
+                .or_else(|| named("depth"))
+                .or_else(|| of_camera.iter().find(is_depth).copied()),
+        };
+        let Some(frame) = frame else { return Ok(None) };
+        let geometry = Geometry::new(&of_camera, name, calibration)?;
+        let header = &frame.header;
+        let pixels = frame.decoded()?;
+        let what = || format!("{name}/{}", header.stream());
+        let Some(depth_m) = image_file::depth_m(header, &pixels)? else { bail!("{}: is not depth", what()) };
+        let intrinsics = geometry.intrinsics(header);
+        let pose = geometry.pose(header);
+        let size = (header.width, header.height);
+        let shown: Vec<f32> =
+            depth_m.iter().map(|d| if f64::from(*d) <= args.max_m { *d } else { 0.0 }).collect();
+        let color = match named("color") {
+            Some(color) if !args.by_camera => colors(color, header, &depth_m, &geometry)?,
+            _ => None,
+        };
+        let mut cloud = PointCloud::default();
+        Deprojection::new(&intrinsics, size)
+            .with_context(what)?
+            .cloud_of_metres(&shown, color.as_deref(), &mut cloud)
+            .with_context(what)?;
+        if color.is_none() {
+            let paint = if args.by_camera { COLORS[index % COLORS.len()] } else { GREY };
+            cloud.colors = vec![paint; cloud.points.len()];
+        }
+        cloud.transform(&pose);
+        Ok(Some(Self {
+            name: name.to_owned(),
+            stream: header.stream().to_owned(),
+            depth_m: shown,
+            size,
+            intrinsics,
+            pose,
+            cloud,
+        }))
+    }
+
+    fn line(&self) -> CameraLine {
+        CameraLine { camera: self.name.clone(), stream: self.stream.clone(), points: self.cloud.points.len() }
+    }
+}
+
+/// Poses and intrinsics of a camera's streams: as recorded, or as a calibration has them.
+struct Geometry<'a> {
+    calibrated: Option<Calibrated<'a>>,
+}
+
+struct Calibrated<'a> {
+    entry: &'a depthrig_calibrate::file::CalibratedCamera,
+    /// From a recorded pose to the calibrated one.
+    correction: Pose,
+}
+
+impl<'a> Geometry<'a> {
+    fn new(frames: &[&DatasetFrame], name: &str, calibration: Option<&'a Calibration>) -> Result<Self> {
+        let Some(calibration) = calibration else { return Ok(Self { calibrated: None }) };
+        for entry in calibration.of_camera(name) {
+            let Some(frame) = frames.iter().find(|f| f.header.stream() == entry.stream) else { continue };
+            let header = &frame.header;
+            if (header.width, header.height) != (entry.width, entry.height) {
+                bail!(
+                    "{name}/{}: was calibrated at {}x{}, the dataset has {}x{}",
+                    entry.stream,
+                    entry.width,
+                    entry.height,
+                    header.width,
+                    header.height
+                );
+            }
+            let correction = entry.pose().compose(&header.pose.inverse());
+            return Ok(Self { calibrated: Some(Calibrated { entry, correction }) });
+        }
+        bail!("the calibration has no stream of camera {name} that the dataset has, too")
+    }
+
+    fn pose(&self, header: &FrameHeader) -> Pose {
+        self.calibrated.as_ref().map_or(header.pose, |c| c.correction.compose(&header.pose))
+    }
+
+    fn intrinsics(&self, header: &FrameHeader) -> Intrinsics {
+        match &self.calibrated {
+            Some(c) if c.entry.source == FileSource::Calibrated && c.entry.stream == header.stream() => {
+                c.entry.intrinsics()
+            }
+            _ => header.intrinsics,
+        }
+    }
+}
+
+/// The colour of each pixel of depth; `None` where it cannot be found, as without intrinsics.
+fn colors(
+    color: &DatasetFrame,
+    depth: &FrameHeader,
+    depth_m: &[f32],
+    geometry: &Geometry<'_>,
+) -> Result<Option<Vec<u8>>> {
+    let rgb = image_file::to_rgb(&color.header, &color.decoded()?)?;
+    let of = |h: &FrameHeader| (geometry.intrinsics(h), (h.width, h.height), geometry.pose(h));
+    let (color_k, color_size, color_pose) = of(&color.header);
+    let (depth_k, depth_size, depth_pose) = of(depth);
+    if same_view((&color_k, color_size, &color_pose), (&depth_k, depth_size, &depth_pose)) {
+        return Ok(Some(rgb.into_raw()));
+    }
+    let between = color_pose.inverse().compose(&depth_pose);
+    let Ok(mut registration) = Registration::new(&depth_k, depth_size, &color_k, color_size, &between) else {
+        return Ok(None);
+    };
+    // In steps of 0.1 mm up to 6.5 m, enough to find a colour.
+    let steps: Vec<u16> = depth_m.iter().map(|d| (d * 1e4).clamp(0.0, 65_535.0) as u16).collect();
+    let mut out = vec![0; depth_m.len() * 3];
+    registration.color_to_depth(&steps, 1e-4, rgb.as_raw(), &mut out)?;
+    Ok(Some(out))
+}
+
+fn pairs(views: &[View]) -> Result<Vec<PairLine>> {
+    let mut lines = Vec::new();
+    for a in views {
+        for b in views.iter().filter(|b| b.name != a.name) {
+            let other =
+                DepthView { depth_m: &b.depth_m, size: b.size, intrinsics: &b.intrinsics, pose: &b.pose };
+            if let Some(found) = agreement(&a.cloud, &other)? {
+                lines.push(PairLine {
+                    points_of: a.name.clone(),
+                    against: b.name.clone(),
+                    points: found.points,
+                    median_mm: found.median_m * 1e3,
+                    median_abs_mm: found.median_abs_m * 1e3,
+                });
+            }
+        }
+    }
+    Ok(lines)
+}
+
+#[derive(Serialize)]
+struct Report {
+    set: u64,
+    points: usize,
+    cameras: Vec<CameraLine>,
+    pairs: Vec<PairLine>,
+}
+
+#[derive(Serialize)]
+struct CameraLine {
+    camera: String,
+    stream: String,
+    points: usize,
+}
+
+/// Points of one camera against the depth of another.
+#[derive(Serialize)]
+struct PairLine {
+    points_of: String,
+    against: String,
+    points: usize,
+    /// Positive: the second camera sees the surface further away.
+    median_mm: f64,
+    median_abs_mm: f64,
+}
+
+impl Report {
+    fn text(&self) -> String {
+        let header = ["POINTS OF", "AGAINST", "POINTS", "MEDIAN mm", "|MEDIAN| mm"];
+        let rows = self.pairs.iter().map(|p| {
+            vec![
+                p.points_of.clone(),
+                p.against.clone(),
+                p.points.to_string(),
+                format!("{:+.2}", p.median_mm),
+                format!("{:.2}", p.median_abs_mm),
+            ]
+        });
+        let pairs = if self.pairs.is_empty() {
+            "no two cameras see the same surface".to_owned()
+        } else {
+            out::table(&header, 2, rows)
+        };
+        format!(
+            "{pairs}\nset {}: {} of {}",
+            self.set,
+            out::count(self.points, "point"),
+            out::count(self.cameras.len(), "camera")
+        )
+    }
+}
