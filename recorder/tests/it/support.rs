@@ -206,6 +206,20 @@ pub fn settle(r: &Recorder) {
     panic!("sets are not settled after ten seconds: {:?}", r.progress());
 }
 
+/// Waits until everything pushed is settled and an account says so, however late the writer's thread is woken. For recorders that sync at
+/// once.
+pub fn accounted(r: &Recorder) {
+    settle(r);
+    let so_far = r.progress().bytes;
+    for _ in 0..10_000 {
+        if r.progress().bytes != so_far {
+            return;
+        }
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    panic!("no account is written in ten seconds: {:?}", r.progress());
+}
+
 /// Records sets one at a time, so that no set is refused for lack of room.
 pub fn record(fs: &MemFs, sets: u64, options: RecorderOptions) -> Summary {
     let r = recorder(fs, options);
