@@ -47,15 +47,22 @@ pub struct Sightings {
     pub refused: Vec<String>,
 }
 
+/// Reads a text file.
+///
+/// # Errors
+/// When it cannot be read, is longer than `limit` bytes or is not text; the message names the file.
+pub fn text(path: &Path, limit: u64, writer: &str) -> Result<String> {
+    let bytes =
+        files::read(path, limit).with_context(|| format!("{}: cannot be read{writer}", path.display()))?;
+    String::from_utf8(bytes).with_context(|| format!("{}: is not text", path.display()))
+}
+
 /// Reads a board's description.
 ///
 /// # Errors
 /// When it cannot be read or is wrong; the message names the file.
 pub fn board(path: &Path) -> Result<Board> {
-    let text = files::read(path, BOARD_MAX_BYTES).with_context(|| {
-        format!("{}: cannot be read; `depthrig calibrate board` writes one", path.display())
-    })?;
-    let text = String::from_utf8(text).with_context(|| format!("{}: is not text", path.display()))?;
+    let text = text(path, BOARD_MAX_BYTES, "; `depthrig calibrate board` writes one")?;
     Board::from_toml(&text).map_err(|e: Error| anyhow::anyhow!("{}: {e}", path.display()))
 }
 
@@ -99,10 +106,7 @@ const CALIBRATION_MAX_BYTES: u64 = 4 << 20;
 /// # Errors
 /// When it cannot be read or is wrong; the message names the file.
 pub fn calibration(path: &Path) -> Result<Calibration> {
-    let text = files::read(path, CALIBRATION_MAX_BYTES).with_context(|| {
-        format!("{}: cannot be read; `depthrig calibrate solve` writes one", path.display())
-    })?;
-    let text = String::from_utf8(text).with_context(|| format!("{}: is not text", path.display()))?;
+    let text = text(path, CALIBRATION_MAX_BYTES, "; `depthrig calibrate solve` writes one")?;
     Calibration::from_toml(&text).map_err(|e: Error| anyhow::anyhow!("{}: {e}", path.display()))
 }
 

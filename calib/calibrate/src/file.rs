@@ -53,23 +53,13 @@ pub struct CalibratedCamera {
     /// Rows of its images.
     pub height: u32,
     /// Whether `intrinsics` were calibrated or are the factory's.
-    pub source: FileSource,
+    pub source: Source,
     /// Its intrinsics.
     pub intrinsics: FileIntrinsics,
     /// Its pose on the mount: `p_mount = R p_camera + t`, optical axes.
     pub pose: FilePose,
     /// Measures of how good they are.
     pub quality: Quality,
-}
-
-/// [`Source`] in the file.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum FileSource {
-    /// [`Source::Calibrated`].
-    Calibrated,
-    /// [`Source::Factory`].
-    Factory,
 }
 
 /// Intrinsics in the file, with the names that `rig.toml` has for them.
@@ -222,7 +212,7 @@ impl CalibratedCamera {
             serial: of.serial.clone(),
             width: camera.size.width,
             height: camera.size.height,
-            source: if calibrated { FileSource::Calibrated } else { FileSource::Factory },
+            source: camera.source,
             intrinsics: FileIntrinsics {
                 model: k.distortion(),
                 fx: k.fx,

@@ -7,6 +7,7 @@
 use crate::Rigid;
 use crate::adjustment::Corner;
 use crate::board_pose::{board_pose, nearest_rotation};
+use crate::rigid::by_motion;
 use depthrig_bus::Intrinsics;
 use depthrig_calib::{Camera, Error, ErrorKind, Result};
 use glam::{DMat3, DVec3};
@@ -354,7 +355,7 @@ impl Equations {
                 let d_base = base_from_hand * d_hand;
                 // A pose that moves its target frame moves the point the other way in the source frame.
                 let rows =
-                    [-motion_row(in_hand, d_hand), motion_row(in_base, d_base), -motion_row(in_base, d_base)];
+                    [-by_motion(in_hand, d_hand), by_motion(in_base, d_base), -by_motion(in_base, d_base)];
                 for (a, row) in places.iter().zip(&rows) {
                     for k in 0..6 {
                         self.right[a + k] -= row[k] * residual[axis];
@@ -398,8 +399,8 @@ impl Equations {
             row[axis] = 1.0 / noise.robot_rad;
             self.add_row(at, &row, rotation[axis]);
             let row = match arrangement {
-                Arrangement::EyeInHand => motion_row(now.translation, unit),
-                Arrangement::EyeToHand => motion_row(DVec3::ZERO, -(now.rotation.conjugate() * unit)),
+                Arrangement::EyeInHand => by_motion(now.translation, unit),
+                Arrangement::EyeToHand => by_motion(DVec3::ZERO, -(now.rotation.conjugate() * unit)),
             };
             self.add_row(at, &(row / noise.robot_m), translation[axis]);
         }
@@ -412,12 +413,6 @@ impl Equations {
         let mut block = self.matrix.fixed_view_mut::<6, 6>(at, at);
         block += row * row.transpose();
     }
-}
-
-/// Change of a value with the given gradient at `p`, as `p` moves like [`Rigid::moved`].
-fn motion_row(p: DVec3, gradient: DVec3) -> Vector6<f64> {
-    let r = p.cross(gradient);
-    Vector6::new(r.x, r.y, r.z, gradient.x, gradient.y, gradient.z)
 }
 
 /// For each view the closed form of the others, and how far this one's board is from theirs.

@@ -128,9 +128,8 @@ fn choose_parameters(
 /// Parts into which views are divided for [`held_out_rms`].
 const FOLDS: usize = 5;
 
-/// Calibrates with each fifth of the views left out and returns the residuals of the views left out, of which the board's pose alone is
-/// estimated: root mean square of their lengths, pixels. Of each view the median decides which corners count, as in
-/// [`robust`].
+/// Calibrates with each fifth of the views left out, and predicts those: of a view left out the board's pose alone is estimated. Returns
+/// the median over views of the root mean square of the residuals' lengths, pixels; one bad view does not decide.
 ///
 /// # Errors
 /// As [`calibrate`].
@@ -153,7 +152,8 @@ pub fn held_out_rms(size: ImageSize, views: &[Vec<Corner>], options: &Intrinsics
     pooled.rms()
 }
 
-/// Residuals of given intrinsics, of which nothing is estimated but the board's poses: root mean square, pixels.
+/// Residuals of given intrinsics, of which nothing is estimated but the board's poses: the median over views, as
+/// [`held_out_rms`], pixels.
 ///
 /// # Errors
 /// [`ErrorKind::BadInput`] if they show no view.

@@ -10,6 +10,7 @@ use depthrig_bus::{Distortion, Intrinsics};
 use depthrig_calib::{Error, ErrorKind, Result};
 use glam::DVec2;
 use nalgebra::Matrix6;
+use serde::{Deserialize, Serialize};
 
 mod advice;
 mod coverage;
@@ -40,8 +41,9 @@ pub struct MountOptions {
     pub keep_factory: bool,
 }
 
-/// Where a camera's intrinsics come from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+/// Origin of a camera's intrinsics.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Source {
     /// Calibrated from these views.
     Calibrated,

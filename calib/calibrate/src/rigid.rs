@@ -2,6 +2,7 @@
 
 use depthrig_bus::Pose;
 use glam::{DMat3, DQuat, DVec3};
+use nalgebra::Vector6;
 
 /// A rotation, then a translation in metres: `p' = R p + t`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -60,6 +61,13 @@ impl Rigid {
         let q = if self.rotation.w < 0.0 { -self.rotation } else { self.rotation };
         q.to_scaled_axis()
     }
+}
+
+/// Change of a value whose gradient at the point `p` is `gradient`, as `p` moves like [`Rigid::moved`]: by the rotation, by the
+/// translation.
+pub(crate) fn by_motion(p: DVec3, gradient: DVec3) -> Vector6<f64> {
+    let by_rotation = p.cross(gradient);
+    Vector6::new(by_rotation.x, by_rotation.y, by_rotation.z, gradient.x, gradient.y, gradient.z)
 }
 
 /// A distance between two poses.

@@ -6,8 +6,9 @@
 
 use crate::Rigid;
 use crate::adjustment::{AdjustedCamera, Covariance, INTRINSIC_PARAMETERS};
+use crate::rigid::by_motion;
 use depthrig_calib::{Camera, Result};
-use glam::{DMat3, DVec2, DVec3};
+use glam::{DMat3, DVec2};
 use nalgebra::{Const, Dyn, Matrix2, OMatrix, SMatrix};
 
 /// Estimates the standard deviation of the projection at `pixel` in its worst direction, pixels, for points at
@@ -45,14 +46,14 @@ pub fn projection_sigma(
     for axis in 0..2 {
         let d_camera = projection.d_point[axis];
         if camera.free_pose {
-            let by = motion(in_camera, d_camera);
+            let by = by_motion(in_camera, d_camera);
             for k in 0..6 {
                 shared[(axis, place.pose + k)] = by[k];
             }
         }
         let d_rig = rotation.transpose() * d_camera;
         for view in views {
-            let by = motion(in_rig, d_rig);
+            let by = by_motion(in_rig, d_rig);
             for k in 0..6 {
                 of_views[*view][(axis, k)] = by[k] * share;
             }
@@ -75,9 +76,4 @@ fn largest_eigenvalue(m: &Matrix2<f64>) -> f64 {
     let half = 0.5 * (m[(0, 0)] + m[(1, 1)]);
     let difference = 0.5 * (m[(0, 0)] - m[(1, 1)]);
     half + difference.hypot(m[(0, 1)])
-}
-
-fn motion(p: DVec3, gradient: DVec3) -> [f64; 6] {
-    let r = p.cross(gradient);
-    [r.x, r.y, r.z, gradient.x, gradient.y, gradient.z]
 }

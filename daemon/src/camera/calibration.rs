@@ -3,7 +3,8 @@
 use crate::config::CameraConfig;
 use depthrig_bus::Pose;
 use depthrig_calib::PoseExt;
-use depthrig_calibrate::file::{CalibratedCamera, FileSource};
+use depthrig_calibrate::file::CalibratedCamera;
+use depthrig_calibrate::mount::Source;
 use depthrig_driver::{DeviceInfo, Error, ErrorKind, Result, StreamProfile};
 
 /// Puts calibrated intrinsics into `profiles`, says so in `info`, and returns the pose of the camera on the mount.
@@ -34,7 +35,7 @@ pub(super) fn apply(
                 ),
             ));
         }
-        if entry.source == FileSource::Calibrated {
+        if entry.source == Source::Calibrated {
             profile.intrinsics = entry.intrinsics();
             info.calibration = format!("calibrated {} ({})", calibration.created, info.calibration);
         }

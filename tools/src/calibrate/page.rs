@@ -1,7 +1,7 @@
 //! The HTML report of a calibration.
 
-use depthrig_calibrate::file::{CalibratedCamera, Calibration, FileSource};
-use depthrig_calibrate::mount::{CameraResult, MountResult};
+use depthrig_calibrate::file::{CalibratedCamera, Calibration};
+use depthrig_calibrate::mount::{CameraResult, MountResult, Source};
 use depthrig_recorder::report::page::{self, END_TABLE, escape};
 use std::fmt::Write as _;
 
@@ -84,7 +84,7 @@ fn cameras(out: &mut String, file: &Calibration) {
         let q = &camera.quality;
         let cells = [
             camera.name.clone(),
-            if camera.source == FileSource::Factory { "factory" } else { "calibrated" }.to_owned(),
+            if camera.source == Source::Factory { "factory" } else { "calibrated" }.to_owned(),
             q.views.to_string(),
             q.corners.to_string(),
             number(Some(q.rms_px), 3),

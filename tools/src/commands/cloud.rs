@@ -9,7 +9,8 @@ use depthrig_bus::{FrameHeader, Intrinsics, PixelFormat, Pose};
 use depthrig_calib::{
     Deprojection, DepthView, PointCloud, PoseExt, Registration, agreement, same_view, write_ply,
 };
-use depthrig_calibrate::file::{Calibration, FileSource};
+use depthrig_calibrate::file::Calibration;
+use depthrig_calibrate::mount::Source;
 use depthrig_recorder::{Dataset, DatasetFrame, DatasetSet, Edge, PixelMode, SetSpan};
 use serde::Serialize;
 use std::path::PathBuf;
@@ -243,7 +244,7 @@ impl<'a> Geometry<'a> {
 
     fn intrinsics(&self, header: &FrameHeader) -> Intrinsics {
         match &self.calibrated {
-            Some(c) if c.entry.source == FileSource::Calibrated && c.entry.stream == header.stream() => {
+            Some(c) if c.entry.source == Source::Calibrated && c.entry.stream == header.stream() => {
                 c.entry.intrinsics()
             }
             _ => header.intrinsics,

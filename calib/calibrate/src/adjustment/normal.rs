@@ -2,8 +2,9 @@
 
 use super::evaluate::{Shape, weight};
 use super::{INTRINSIC_PARAMETERS, Layout, Problem};
+use crate::rigid::by_motion;
 use depthrig_calib::Camera;
-use glam::{DMat3, DVec3};
+use glam::DMat3;
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn, Matrix6, SMatrix, Vector6};
 
 /// Unknowns of a camera at the most, those of the board's shape, and those of a view.
@@ -98,7 +99,7 @@ impl Normal {
                 let d_rig = rig_from_camera * d_camera;
                 let mut row = Row {
                     shared: [0.0; ROW],
-                    view: motion(in_rig, d_rig) * root,
+                    view: by_motion(in_rig, d_rig) * root,
                     residual: residual[axis] * root,
                 };
                 for (k, parameter) in free.iter().enumerate() {
@@ -106,7 +107,7 @@ impl Normal {
                 }
                 let mut next = free.len();
                 if camera.free_pose {
-                    let by = motion(in_camera, d_camera);
+                    let by = by_motion(in_camera, d_camera);
                     for k in 0..6 {
                         row.shared[next + k] = by[k] * root;
                     }
@@ -214,11 +215,4 @@ pub(super) struct ReducedView {
     pub(super) inverse: Matrix6<f64>,
     /// `V⁻¹ Wᵀ`.
     pub(super) back: nalgebra::OMatrix<f64, nalgebra::Const<6>, Dyn>,
-}
-
-/// Change of a value whose gradient at the point `p` is `gradient`, as `p` moves like [`crate::Rigid::moved`]: by the rotation, by
-/// the translation.
-fn motion(p: DVec3, gradient: DVec3) -> Vector6<f64> {
-    let by_rotation = p.cross(gradient);
-    Vector6::new(by_rotation.x, by_rotation.y, by_rotation.z, gradient.x, gradient.y, gradient.z)
 }

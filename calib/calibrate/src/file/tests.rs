@@ -8,7 +8,7 @@ fn file() -> Calibration {
         serial: "123".to_owned(),
         width: 640,
         height: 480,
-        source: FileSource::Calibrated,
+        source: Source::Calibrated,
         intrinsics: FileIntrinsics {
             model: Distortion::BrownConrady,
             fx: 600.125,

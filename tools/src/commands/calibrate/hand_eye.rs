@@ -8,7 +8,7 @@ use crate::out;
 use crate::progress::Progress;
 use crate::signals::Stop;
 use anyhow::{Context as _, Result, bail};
-use depthrig_bus::{Pose, files};
+use depthrig_bus::Pose;
 use depthrig_calibrate::file::CalibratedCamera;
 use depthrig_calibrate::hand_eye::{Arrangement, HandEye, HandEyeView, Noise, hand_eye};
 use depthrig_calibrate::{Distance, Rigid};
@@ -68,7 +68,7 @@ const POSES_MAX_BYTES: u64 = 16 << 20;
 /// Reads, estimates and prints.
 pub fn run(args: &HandEyeArgs, context: &Context) -> Result<Exit> {
     let board = calibrate::board(&args.board)?;
-    let poses = poses(&text(&args.poses, POSES_MAX_BYTES)?)
+    let poses = poses(&calibrate::text(&args.poses, POSES_MAX_BYTES, "")?)
         .with_context(|| format!("{}: invalid poses", args.poses.display()))?;
     let camera = camera(&args.calibration, &args.images.name)?;
     let stop = Stop::on_signals()?;
@@ -117,11 +117,6 @@ pub fn run(args: &HandEyeArgs, context: &Context) -> Result<Exit> {
         out::line(result.text(&noise))?;
     }
     Ok(if left_out.is_empty() { Exit::Good } else { Exit::Lost })
-}
-
-fn text(path: &Path, limit: u64) -> Result<String> {
-    let bytes = files::read(path, limit).with_context(|| format!("{}: cannot be read", path.display()))?;
-    String::from_utf8(bytes).with_context(|| format!("{}: is not text", path.display()))
 }
 
 fn camera(path: &Path, name: &str) -> Result<CalibratedCamera> {
