@@ -7,6 +7,7 @@
 mod camera;
 pub(crate) mod controls;
 mod error;
+pub(crate) mod pose;
 pub(crate) mod read;
 mod refine;
 mod rig;

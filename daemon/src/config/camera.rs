@@ -1,11 +1,12 @@
 //! From a `[[camera]]` table to [`CameraConfig`]: the keys that all families share.
 
+use super::pose::pose;
 use super::read::{Located, Section};
 use super::value::rate;
 use super::wanted::WantedStream;
 use super::{CameraConfig, StereoConfig, refine, stereo};
 use crate::family::{Family, Reader};
-use depthrig_bus::{CameraName, Name, PixelFormat, Pose, StreamName};
+use depthrig_bus::{CameraName, Name, PixelFormat, StreamName};
 use depthrig_driver::StreamRequest;
 use std::path::Path;
 
@@ -32,7 +33,7 @@ pub(super) fn read(
     }
     let names: Vec<_> = families.iter().map(|f| (f.name, f)).collect();
     let family = s.choose("backend", &names);
-    let pose = pose(&s);
+    let pose = pose(&s, "pose", "pose = { }");
     let wanted = streams(&s);
     let streams: Vec<_> = wanted.iter().map(|w| w.request.clone()).collect();
     let has_stereo = family.is_some_and(|f| f.has_stereo);
@@ -55,43 +56,6 @@ pub(super) fn read(
     let backend = backend?;
     let streams = if streams.is_empty() { backend.default_streams() } else { streams };
     Some(CameraConfig { name, pose, streams, record, stereo, refine, backend, calibration: Vec::new() })
-}
-
-fn pose(camera: &Section<'_, '_>) -> Pose {
-    let s = camera.table("pose", "pose = { }");
-    let translation_m = s.or("translation_m", [0.0; 3], |_| Ok(()));
-    let quaternion = s.get::<[f64; 4]>("rotation_xyzw");
-    let angles = s.get::<[f64; 3]>("rotation_rpy_deg");
-    let rotation_xyzw = match (quaternion, angles) {
-        (None, None) => Pose::IDENTITY.rotation_xyzw,
-        (None, Some(a)) => quaternion_of_rpy_deg(a.value),
-        (Some(q), None) => {
-            let norm = q.value.iter().map(|c| c * c).sum::<f64>().sqrt();
-            if (norm - 1.0).abs() > 1e-3 {
-                let why = format!("must be a quaternion x, y, z, w of length 1; its length is {norm:.4}");
-                s.problem(q.at, format!("{} {why}", s.key_of("rotation_xyzw")));
-            }
-            q.value.map(|c| c / norm)
-        }
-        (Some(q), Some(a)) => {
-            s.problem(q.at.max(a.at), "rotation_xyzw and rotation_rpy_deg say the same thing; keep one");
-            Pose::IDENTITY.rotation_xyzw
-        }
-    };
-    s.finish();
-    Pose { translation_m, rotation_xyzw }
-}
-
-/// The unit quaternion of turns about the fixed axes x, then y, then z of the mount (roll, pitch, yaw as in URDF):
-/// `R = Rz(yaw) Ry(pitch) Rx(roll)`.
-fn quaternion_of_rpy_deg(angles: [f64; 3]) -> [f64; 4] {
-    let [(sr, cr), (sp, cp), (sy, cy)] = angles.map(|a| (a.to_radians() / 2.0).sin_cos());
-    [
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-        cr * cp * cy + sr * sp * sy,
-    ]
 }
 
 fn streams(camera: &Section<'_, '_>) -> Vec<WantedStream> {

@@ -10,6 +10,7 @@ use depthrig_realsense::RealsenseConfig;
 use depthrig_realsense::l515::L515Config;
 use depthrig_sim::files::FilesConfig;
 use depthrig_sim::synthetic::SyntheticConfig;
+use depthrig_sim::synthetic::board::BoardScene;
 use depthrig_v4l2::V4l2Config;
 use depthrig_zed::ZedConfig;
 use depthrig_zed::replay::ZedPlaybackConfig;
@@ -77,6 +78,7 @@ fn every_key_is_in_the_default_file() {
 fn plain(table: &str) -> String {
     match table {
         "pose = { }" => "camera.pose".to_owned(),
+        "displaced = { }" => "camera.board.displaced".to_owned(),
         _ => table.trim_matches(['[', ']']).to_owned(),
     }
 }
@@ -110,6 +112,11 @@ fn a_synthetic_camera_can_be_told_everything_that_its_driver_knows() {
     }
     for key in driver["clock"].as_table().unwrap().keys() {
         assert!(has("[camera.clock]", key), "{key}");
+    }
+    let board = toml::Table::try_from(BoardScene::default()).unwrap();
+    // The sheet is made of the file.
+    for key in board.keys().filter(|k| *k != "sheet") {
+        assert!(has("[camera.board]", key), "{key}");
     }
 }
 

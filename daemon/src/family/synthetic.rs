@@ -4,15 +4,22 @@
 //! otherwise default configuration, and the driver's error is reported at the key's own line.
 
 use super::{BackendConfig, CameraSettings, Family, Offered, OpenContext, Preparation, Reader, Source};
+use crate::config::pose::pose;
 use crate::config::read::{FromToml, Located, Section, nearest};
 use crate::config::value::resolve;
-use depthrig_driver::{Backend, Result, StreamRequest, choose_profiles};
+use depthrig_bus::files;
+use depthrig_calibrate::board::{Board, Drawing, Paper};
+use depthrig_driver::{Backend, Error, ErrorKind, Result, StreamRequest, choose_profiles};
+use depthrig_sim::synthetic::board::{Black, BoardMotion, BoardScene, Sheet};
 use depthrig_sim::synthetic::models::MODELS;
 use depthrig_sim::synthetic::{
-    self, ClockSim, Drawing, FaultKind, ScheduledFault, StreamOverride, SyntheticBackend, SyntheticConfig,
-    imu, profiles,
+    self, ClockSim, Drawing as SceneDrawing, FaultKind, ScheduledFault, StreamOverride, SyntheticBackend,
+    SyntheticConfig, imu, profiles,
 };
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+
+/// A description of a board is no longer than this, bytes.
+const BOARD_MAX_BYTES: u64 = 64 << 10;
 
 pub(super) const FAMILY: Family = Family::new("synthetic", |r| Some(BackendConfig::new(read(r))));
 
@@ -41,6 +48,7 @@ fn read(r: &Reader<'_>) -> SyntheticConfig {
         cache_dir: s.get::<PathBuf>("cache_dir").map_or(d.cache_dir, |f| resolve(r.base, &f.value)),
         cheap: field(s, "cheap", d.cheap, |c, v| c.cheap = v),
         ring_frames: field(s, "ring_frames", d.ring_frames, |c, v| c.ring_frames = v),
+        board: s.has("board").then(|| board(s, r.base)),
     };
     for wanted in streams {
         let StreamRequest { stream, size, rate_hz, .. } = wanted.request.clone();
@@ -108,6 +116,53 @@ fn clock(camera: &Section<'_, '_>) -> ClockSim {
     config
 }
 
+fn board(camera: &Section<'_, '_>, base: &Path) -> BoardScene {
+    let table = camera.table("board", "[camera.board]");
+    let s = &table;
+    let d = BoardScene::default();
+    let with = |change: &dyn Fn(&mut BoardScene)| {
+        let mut board = BoardScene::default();
+        change(&mut board);
+        Some(board)
+    };
+    let motions = BoardMotion::ALL.map(|m| (wire_name(m), m));
+    let motions = motions.each_ref().map(|(name, motion)| (name.as_str(), *motion));
+    let scene = BoardScene {
+        file: s.required::<PathBuf>("file", "\"board.toml\"").map_or(d.file, |f| resolve(base, &f.value)),
+        sheet: d.sheet,
+        motion: s.choose("motion", &motions).unwrap_or(d.motion),
+        seed: field(s, "seed", d.seed, |_, _| ()),
+        hold_s: field(s, "hold_s", d.hold_s, |c, v| c.board = with(&|b| b.hold_s = v)),
+        displaced: pose(s, "displaced", "displaced = { }"),
+        depth_scale: field(s, "depth_scale", d.depth_scale, |c, v| {
+            c.board = with(&|b| b.depth_scale = v);
+        }),
+        depth_offset_mm: field(s, "depth_offset_mm", d.depth_offset_mm, |c, v| {
+            c.board = with(&|b| b.depth_offset_mm = v);
+        }),
+    };
+    table.finish();
+    scene
+}
+
+/// The print that a board's description stands for.
+fn sheet(path: &Path) -> Result<Sheet> {
+    let wrong = |why: String| Error::new(ErrorKind::BadInput, format!("board {}: {why}", path.display()));
+    let text = files::read_to_string(path, BOARD_MAX_BYTES)
+        .map_err(|e| wrong(format!("cannot be read ({e}); `depthrig calibrate board` writes one")))?;
+    let board = Board::from_toml(&text).map_err(|e| wrong(e.to_string()))?;
+    let drawing = Drawing::new(&board, Paper::around(&board)).map_err(|e| wrong(e.to_string()))?;
+    let metres = board.scale() * 1e-3;
+    let black = drawing.black.iter().map(|r| Black {
+        x_m: r.x * metres,
+        y_m: r.y * metres,
+        width_m: r.width * metres,
+        height_m: r.height * metres,
+    });
+    let size_m = [drawing.paper.width_mm * metres, drawing.paper.height_mm * metres];
+    Ok(Sheet { size_m, black: black.collect() })
+}
+
 fn fault(s: Section<'_, '_>) -> Option<ScheduledFault> {
     let names = FaultKind::ALL.map(|kind| (wire_name(kind), kind));
     let kinds = names.each_ref().map(|(name, kind)| (name.as_str(), *kind));
@@ -128,8 +183,8 @@ fn fault(s: Section<'_, '_>) -> Option<ScheduledFault> {
     fault
 }
 
-/// The name that serde gives the fault.
-fn wire_name(kind: FaultKind) -> String {
+/// The name that serde gives a variant.
+fn wire_name(kind: impl serde::Serialize) -> String {
     serde_json::to_value(kind).ok().and_then(|v| v.as_str().map(str::to_owned)).unwrap_or_default()
 }
 
@@ -184,10 +239,13 @@ impl CameraSettings for SyntheticConfig {
         if let Some(dir) = given.cache_dir {
             dir.clone_into(&mut self.cache_dir);
         }
+        if let Some(board) = &mut self.board {
+            board.sheet = sheet(&board.file)?;
+        }
         given.render.map_or(Ok(()), |progress| synthetic::prepare(self, progress))
     }
 
-    fn add_to_drawing(&self, drawing: &Drawing) -> Result<()> {
+    fn add_to_drawing(&self, drawing: &SceneDrawing) -> Result<()> {
         drawing.plan(self)
     }
 }

@@ -7,6 +7,7 @@
 //! and pass through the same [`depthrig_driver::Gate`] as those of a real device; [`SimTruth`] knows what really happened.
 
 mod backend;
+pub mod board;
 mod cache;
 mod color;
 mod config;

@@ -86,6 +86,13 @@ impl Paper {
         }
     }
 
+    /// A sheet on which the board just fits.
+    #[must_use]
+    pub fn around(board: &Board) -> Self {
+        let size = extent(board);
+        Self { width_mm: size.width + 2.0 * MARGIN_MM, height_mm: size.height + 2.0 * MARGIN_MM + FOOTER_MM }
+    }
+
     /// The largest square of whole millimetres with which a board of so many fits.
     pub(super) fn largest_square_mm(&self, board: &Board) -> f64 {
         let unit = extent(&Board { square_mm: 1.0, marker_mm: Some(0.3), ..board.clone() });

@@ -1,5 +1,6 @@
 //! The synthetic backend: simulated cameras behind the traits of every other one.
 
+use super::board::{Moment, Painter};
 use super::config::{FaultKind, SyntheticConfig};
 use super::drawing::Drawing;
 use super::imu::{Batch, Filler};
@@ -8,9 +9,11 @@ use super::profiles::Content;
 use super::queue::{Queue, Waiting};
 use super::render::{self, Images};
 use super::unit::{DueFault, SimFrame, SimTruth, Unit};
-use super::{NAME, motion, overlay};
+use super::view::Rays;
+use super::{NAME, motion, noise, overlay};
 use core::time::Duration;
 use depthrig_bus::{DropReason, FrameFlags, HostTime};
+use depthrig_calib::PoseExt;
 use depthrig_driver::{
     Backend, Device, DeviceInfo, Error, ErrorKind, FrameSink, Gate, Poll, RawFrame, Result, Stream,
     StreamProfile, StreamRequest, choose_profiles,
@@ -168,6 +171,8 @@ impl Device for SyntheticDevice {
                 width: p.width,
                 frame_bytes: p.frame_bytes(),
                 has_strip: content == Content::Color && !motion,
+                content,
+                board: (!motion && !config.cheap).then(|| painter(config, p)).flatten(),
             }
         });
         let streams = streams.collect();
@@ -192,6 +197,8 @@ struct StreamState {
     width: u32,
     frame_bytes: usize,
     has_strip: bool,
+    content: Content,
+    board: Option<Painter>,
 }
 
 #[derive(Debug)]
@@ -285,7 +292,7 @@ impl SyntheticStream {
         let stream = &mut self.streams[i];
         let config = &unit.config;
         let steps = motion::steps(unit.world_start, waiting.capture, config.pose_rate_hz);
-        let pose = motion::to_and_fro(steps, config.poses);
+        let pose = motion::to_and_fro(steps, config.rendered_poses());
         let counted = match &mut stream.source {
             Source::Motion(filler) => filler.count(waiting.k, &waiting.boot),
             _ => waiting.k,
@@ -316,6 +323,8 @@ impl SyntheticStream {
             drift_ppm: config.clock.drift_ppm,
         };
         let source = &mut stream.source;
+        let board = &stream.board;
+        let content = stream.content;
         stream.gate.deliver_timed(&raw, sink, |memory, meta| {
             match source {
                 Source::Motion(filler) => filler.fill(&batch, meta, memory),
@@ -326,6 +335,16 @@ impl SyntheticStream {
                         return Err(DropReason::WrongSize);
                     }
                     memory.copy_from_slice(image);
+                    if let Some(board) = board {
+                        let moment = Moment { world_start: unit.world_start, capture, frame: sequence };
+                        match content {
+                            Content::Color => board.color(memory, moment),
+                            Content::Depth => board.depth(memory, unit.model, false, moment),
+                            Content::DepthTrue | Content::DepthTrueColor => {
+                                board.depth(memory, unit.model, true, moment);
+                            }
+                        }
+                    }
                     if has_strip {
                         overlay::draw(memory, width, sequence as u32);
                     }
@@ -334,6 +353,15 @@ impl SyntheticStream {
             Ok(())
         });
     }
+}
+
+/// The painter of the board into the images of a stream.
+fn painter(config: &SyntheticConfig, p: &StreamProfile) -> Option<Painter> {
+    let board = config.board.as_ref()?;
+    let rays = Rays::new(&p.intrinsics, p.width, p.height);
+    let sensor = config.true_pose().compose(&p.pose_in_device);
+    let seed = noise::text_seed(config.seed, &config.serial_or_default());
+    Some(Painter::new(board, rays, &sensor, seed))
 }
 
 /// Does what a fault does to the frames of one stream.

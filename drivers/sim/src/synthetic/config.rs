@@ -1,6 +1,8 @@
 //! The configuration of a simulated camera, as plain values that a rig file maps onto.
 
+use super::board::BoardScene;
 use depthrig_bus::{Pose, StreamName};
+use depthrig_calib::PoseExt;
 use depthrig_driver::{Error, ErrorKind, Result};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
@@ -41,6 +43,8 @@ pub struct SyntheticConfig {
     pub cheap: bool,
     /// Frames that the device keeps while nobody fetches them; older ones are lost.
     pub ring_frames: u32,
+    /// A printed board in front of the mount, which then stands still.
+    pub board: Option<BoardScene>,
 }
 
 impl Default for SyntheticConfig {
@@ -61,6 +65,7 @@ impl Default for SyntheticConfig {
             cache_dir: default_cache_dir(),
             cheap: false,
             ring_frames: 8,
+            board: None,
         }
     }
 }
@@ -214,6 +219,16 @@ impl SyntheticConfig {
         if self.serial.is_empty() { format!("sim-{}", self.model) } else { self.serial.clone() }
     }
 
+    /// Where the camera really is on the mount.
+    pub(crate) fn true_pose(&self) -> Pose {
+        self.board.as_ref().map_or(self.pose_on_mount, |b| self.pose_on_mount.compose(&b.displaced))
+    }
+
+    /// Poses of the mount that are rendered: beside a board it stands still.
+    pub(crate) const fn rendered_poses(&self) -> u32 {
+        if self.board.is_some() { 1 } else { self.poses }
+    }
+
     /// How messages name the camera.
     pub(crate) fn label(&self) -> String {
         format!("synthetic camera {} ({})", self.serial_or_default(), self.model)
@@ -246,6 +261,8 @@ impl SyntheticConfig {
         } else if !finite(&[c.stamp_jitter_us, c.latency_ms, c.latency_jitter_ms, c.stall_ms.0, c.stall_ms.1])
         {
             Some("clock has a latency, jitter or stall that is negative or not a number".to_owned())
+        } else if let Some(problem) = self.board.as_ref().and_then(BoardScene::problem) {
+            Some(problem)
         } else if !(0.0..=1.0).contains(&c.stall_probability) || c.stall_ms.0 > c.stall_ms.1 {
             Some(
                 "clock.stall_probability must be within 0..=1 and clock.stall_ms be [least, most]".to_owned(),

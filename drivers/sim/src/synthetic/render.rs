@@ -94,7 +94,7 @@ pub fn prepare_all(configs: &[SyntheticConfig], progress: Progress<'_>) -> Resul
     progress(0, total);
     for (config, profile) in jobs {
         images(config, &profile, &|n, _| progress(done + n, total))?;
-        done += config.poses as usize;
+        done += config.rendered_poses() as usize;
         progress(done, total);
     }
     Ok(())
@@ -140,12 +140,12 @@ impl Scene {
 
     /// Poses to be rendered.
     pub(crate) const fn poses(&self) -> usize {
-        self.config.poses as usize
+        self.config.rendered_poses() as usize
     }
 
     fn wanted(&self) -> Wanted<'_> {
         let bytes = self.profile.frame_bytes();
-        Wanted { key: &self.key, planes: self.planes, poses: self.config.poses, bytes }
+        Wanted { key: &self.key, planes: self.planes, poses: self.config.rendered_poses(), bytes }
     }
 
     /// The images of `album` that this stream shows.
@@ -171,7 +171,7 @@ impl Scene {
                 return Err(Error::new(ErrorKind::Io, "rendering was stopped"));
             }
             let made = self.render(&world, &rays, pose);
-            progress(pose as usize + 1, config.poses as usize);
+            progress(pose as usize + 1, config.rendered_poses() as usize);
             Ok(made)
         })
     }
@@ -194,8 +194,8 @@ impl Scene {
     /// Every plane at `pose`.
     fn render(&self, world: &World, rays: &Rays, pose: u32) -> Vec<Vec<u8>> {
         let Self { config, model, .. } = self;
-        let camera = config.pose_on_mount.compose(&self.profile.pose_in_device).to_affine();
-        let view = View::new(rays, &(motion::mount(pose, config.poses) * camera));
+        let camera = config.true_pose().compose(&self.profile.pose_in_device).to_affine();
+        let view = View::new(rays, &(motion::mount(pose, config.rendered_poses()) * camera));
         let seed = mix(text_seed(config.seed, &config.serial_or_default()).wrapping_add(u64::from(pose)));
         let bytes = |counts: Vec<u16>| counts.iter().flat_map(|z| z.to_le_bytes()).collect();
         match self.content {
@@ -229,7 +229,7 @@ fn key(config: &SyntheticConfig, model: &Model, p: &StreamProfile, planes: u32) 
     format!(
         "render {RENDER_VERSION} {stream} planes {planes} poses {} seed {} serial {} model {} {:?} unit {} range {:?} \
          white {:?} size {}x{} {:?} on mount {:?} in device {:?}",
-        config.poses,
+        config.rendered_poses(),
         config.seed,
         config.serial_or_default(),
         model.name,
@@ -240,7 +240,7 @@ fn key(config: &SyntheticConfig, model: &Model, p: &StreamProfile, planes: u32) 
         p.width,
         p.height,
         p.intrinsics,
-        config.pose_on_mount,
+        config.true_pose(),
         p.pose_in_device
     )
 }
