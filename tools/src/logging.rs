@@ -7,18 +7,26 @@ use std::io::{self, IsTerminal};
 use tracing::field::Field;
 use tracing::level_filters::LevelFilter;
 use tracing_subscriber::field::MakeExt;
+use tracing_subscriber::filter::filter_fn;
 use tracing_subscriber::fmt;
 use tracing_subscriber::fmt::format::{Writer, debug_fn};
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::util::SubscriberInitExt;
 
 /// Starts logging with the options of `global`, at `loudness` levels above the default.
 pub fn start(global: &Global, loudness: i32) {
     let level = level(i32::from(global.verbose) - i32::from(global.quiet) + loudness);
     let no_color = std::env::var_os("NO_COLOR").is_some_and(|v| !v.is_empty());
     let color = wants_color(global.color, no_color, std::io::stderr().is_terminal());
+    // To that library a board that is partly out of the image is worth a warning; depthrig says itself where a board was found.
+    let is_ours = filter_fn(move |m| level >= LevelFilter::DEBUG || !m.target().starts_with("calib_targets"));
     let logs = fmt().with_max_level(level).with_writer(io::stderr).with_target(global.verbose > 1);
     match global.log_format {
-        LogFormat::Text => logs.with_ansi(color).fmt_fields(debug_fn(field).delimited(" ")).init(),
-        LogFormat::Json => logs.json().flatten_event(true).init(),
+        LogFormat::Text => {
+            let text = logs.with_ansi(color).fmt_fields(debug_fn(field).delimited(" "));
+            text.finish().with(is_ours).init();
+        }
+        LogFormat::Json => logs.json().flatten_event(true).finish().with(is_ours).init(),
     }
 }
 
