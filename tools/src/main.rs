@@ -7,6 +7,7 @@ mod args;
 mod bench;
 mod calibrate;
 mod cli;
+mod cloud_image;
 mod commands;
 mod context;
 mod demo;

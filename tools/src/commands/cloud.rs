@@ -3,7 +3,7 @@
 use crate::calibrate;
 use crate::exit::Exit;
 use crate::outfile::{OutFile, Overwrite};
-use crate::{image_file, out};
+use crate::{cloud_image, image_file, out};
 use anyhow::{Context as _, Result, bail};
 use depthrig_bus::{FrameHeader, Intrinsics, PixelFormat, Pose};
 use depthrig_calib::{
@@ -50,6 +50,9 @@ pub struct CloudArgs {
     /// Point cloud to write (PLY)
     #[arg(long, value_name = "FILE", default_value = "cloud.ply")]
     out: PathBuf,
+    /// Picture of the cloud to write (PNG), seen from beside the mount
+    #[arg(long, value_name = "FILE")]
+    image: Option<PathBuf>,
     #[command(flatten)]
     overwrite: Overwrite,
     /// Print JSON
@@ -75,6 +78,7 @@ pub fn run(args: &CloudArgs) -> Result<Exit> {
     let dataset = Dataset::open(&args.dataset)?;
     let calibration = args.calibration.as_deref().map(calibrate::calibration).transpose()?;
     let file = OutFile::new(&args.out, args.overwrite, &[])?;
+    let image = args.image.as_ref().map(|path| OutFile::new(path, args.overwrite, &[])).transpose()?;
     let set = set(&dataset, args.set)?;
     let mut views = Vec::new();
     let mut cameras: Vec<String> = Vec::new();
@@ -103,6 +107,9 @@ pub fn run(args: &CloudArgs) -> Result<Exit> {
     let mut bytes = Vec::new();
     write_ply(&all, &mut bytes)?;
     file.write(&bytes)?;
+    if let Some(image) = &image {
+        image.write(&image_file::png(&cloud_image::draw(&all))?)?;
+    }
     let report = Report {
         set: set.id,
         points: all.points.len(),
@@ -113,7 +120,8 @@ pub fn run(args: &CloudArgs) -> Result<Exit> {
         out::json(&report)?;
     } else {
         out::line(report.text())?;
-        out::line(format_args!("written   {}", file.path().display()))?;
+        let image = image.map_or_else(String::new, |i| format!(", {}", i.path().display()));
+        out::line(format_args!("written   {}{image}", file.path().display()))?;
     }
     Ok(Exit::Good)
 }
@@ -184,7 +192,12 @@ impl View {
             .with_context(what)?
             .cloud_of_metres(&shown, color.as_deref(), &mut cloud)
             .with_context(what)?;
-        if color.is_none() {
+        if color.is_some() {
+            // Black is what a place outside the colour image gets.
+            for color in cloud.colors.iter_mut().filter(|c| **c == [0; 3]) {
+                *color = GREY;
+            }
+        } else {
             let paint = if args.by_camera { COLORS[index % COLORS.len()] } else { GREY };
             cloud.colors = vec![paint; cloud.points.len()];
         }
