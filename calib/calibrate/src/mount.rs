@@ -192,6 +192,10 @@ pub fn calibrate_mount(
     Ok(result)
 }
 
+/// The residuals of new intrinsics must be less than this share of the factory's to replace them: a difference that chance makes with some
+/// thousand corners is no reason, and the factory looked at the whole image.
+const CLEARLY_LESS: f64 = 0.97;
+
 /// Intrinsics to go on with.
 struct Chosen {
     intrinsics: Intrinsics,
@@ -232,7 +236,7 @@ fn choose(index: usize, camera: &CameraInput, views: &[RigView], options: MountO
     let again = IntrinsicsOptions { free: Some(free), start: Some(found.camera.intrinsics), ..settings };
     let held_out_px = intrinsics::held_out_rms(camera.size, &of_camera, &again).ok();
     if let (Some(factory), Some(theirs), Some(ours)) = (camera.factory, factory_px, held_out_px)
-        && theirs <= ours
+        && theirs * CLEARLY_LESS <= ours
     {
         return Ok(keep(factory, Some(ours)));
     }

@@ -62,7 +62,7 @@ fn of_camera(camera: &CameraResult, lines: &mut Vec<String>) {
         (camera.source, camera.factory_px, camera.held_out_px)
     {
         lines.push(format!(
-            "{name}: the factory's intrinsics leave {theirs:.2} px on these views, the new ones {ours:.2} px on views that they were not \
+            "{name}: the factory's intrinsics leave {theirs:.3} px on these views, the new ones {ours:.3} px on views that they were not \
              fitted to"
         ));
     }
