@@ -20,14 +20,17 @@ FEED := .venv-feed
 OAK := .venv-oak
 REQUIREMENTS := python/requirements-test.txt $(READERS)/requirements.txt
 
-.PHONY: help demo environments test check-debian13 test-long vm fuzz lint bench bench-peers bench-feed clean setup-build setup-test setup-vm setup-peers setup-fuzz
+.PHONY: help demo demo-calibration environments test check-debian13 test-long vm fuzz lint bench bench-peers bench-feed clean setup-build setup-test setup-vm setup-peers setup-fuzz
 
 help: ## show this list
-	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-14s %s\n", $$1, $$2}'
+	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-16s %s\n", $$1, $$2}'
 
 demo: setup-build ## the mount of seven cameras with ten depth modes, without a camera: record, verify, replay, report
 	@tools/onnxruntime.sh || true
 	tools/demo.sh $(ARGS)
+
+demo-calibration: setup-build ## seven simulated cameras and a printed board: views, calibration, the cloud before and after
+	tools/demo-calibration.sh $(ARGS)
 
 environments: $(VENV)/.stamp $(LEROBOT)/.stamp $(OAK)/.stamp $(READERS)/node_modules/.stamp ## the environments of Python and Node that tests need
 	tools/python.sh environments

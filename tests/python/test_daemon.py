@@ -95,8 +95,10 @@ def environment(runtime: Path) -> dict[str, str]:
 
 
 @contextmanager
-def running(binary: str, runtime: Path, log: Path, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
-    """A depthrig process that is ended with Ctrl-C and must then end well."""
+def running(
+    binary: str, runtime: Path, log: Path, *arguments: str, codes: tuple[int, ...] = (0,)
+) -> Iterator[subprocess.Popen[bytes]]:
+    """A depthrig process that is ended with Ctrl-C and must then end with one of `codes`."""
     with log.open("wb") as out:
         process = subprocess.Popen([binary, *arguments], env=environment(runtime), stdout=out, stderr=out)
     try:
@@ -114,7 +116,7 @@ def running(binary: str, runtime: Path, log: Path, *arguments: str) -> Iterator[
         process.kill()
         process.wait()
         code = None
-    assert code == 0, f"{arguments[0]} ended with {code}:\n{log.read_text(errors='replace')}"
+    assert code in codes, f"{arguments[0]} ended with {code}:\n{log.read_text(errors='replace')}"
 
 
 def command(binary: str, runtime: Path, *arguments: str, codes: tuple[int, ...] = (0,)) -> str:
