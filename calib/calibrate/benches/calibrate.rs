@@ -7,10 +7,10 @@ mod common;
 use common::{Random, mount, mount_cameras, mount_views};
 use criterion::{Criterion, criterion_group, criterion_main};
 use depthrig_bus::Distortion;
-use depthrig_calibrate::adjustment::Corner;
+use depthrig_calibrate::adjustment::{AdjustedCamera, Corner};
 use depthrig_calibrate::board::{Board, Drawing, Paper, Pattern};
 use depthrig_calibrate::detect::{GrayImage, detector};
-use depthrig_calibrate::intrinsics::{self, IntrinsicsOptions};
+use depthrig_calibrate::intrinsics::{self, ImageSize, IntrinsicsOptions};
 use depthrig_calibrate::rig::{RigOptions, calibrate_rig};
 use glam::{DMat3, DVec2, DVec3};
 
@@ -90,10 +90,16 @@ fn solver(c: &mut Criterion) {
     let views = mount_views(&truth, 40, &mut Random(1));
     let of_first: Vec<Vec<Corner>> =
         views.iter().flat_map(|v| &v.seen).filter(|s| s.camera == 0).map(|s| s.corners.clone()).collect();
+    let size = ImageSize { width: 640, height: 480 };
     let options = IntrinsicsOptions { model: Distortion::BrownConrady, ..IntrinsicsOptions::default() };
     let name = format!("intrinsics, {} views", of_first.len());
     group.bench_function(name, |b| {
-        b.iter(|| intrinsics::calibrate(cameras[0].size, &of_first, &options).unwrap());
+        b.iter(|| intrinsics::calibrate(size, &of_first, &options).unwrap());
+    });
+    // The same without the choice of coefficients, for which ten parts of the views are fitted as well.
+    let one = IntrinsicsOptions { free: Some(AdjustedCamera::all_free(options.model)), ..options };
+    group.bench_function("intrinsics, one fit", |b| {
+        b.iter(|| intrinsics::calibrate(size, &of_first, &one).unwrap());
     });
     group.bench_function("seven cameras, 40 views", |b| {
         b.iter(|| calibrate_rig(&cameras, &views, &RigOptions::default()).unwrap());

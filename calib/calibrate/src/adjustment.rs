@@ -119,7 +119,7 @@ pub struct Solution {
 }
 
 /// Relative decrease of the cost below which the adjustment has converged.
-const CONVERGED: f64 = 1e-13;
+const CONVERGED: f64 = 1e-11;
 /// Damping above which no step can help.
 const MAX_DAMPING: f64 = 1e12;
 

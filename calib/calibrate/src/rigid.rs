@@ -1,7 +1,7 @@
 //! Rigid transforms as the optimiser needs them: composed, inverted, moved by small steps.
 
 use depthrig_bus::Pose;
-use glam::{DMat3, DQuat, DVec3};
+use glam::{DAffine3, DMat3, DQuat, DVec3};
 use nalgebra::Vector6;
 
 /// A rotation, then a translation in metres: `p' = R p + t`.
@@ -25,6 +25,11 @@ impl Rigid {
     /// `R p + t`.
     pub fn transform(&self, p: DVec3) -> DVec3 {
         self.rotation * p + self.translation
+    }
+
+    /// The same as a matrix, with which many points are transformed faster.
+    pub fn affine(&self) -> DAffine3 {
+        DAffine3::from_rotation_translation(self.rotation, self.translation)
     }
 
     /// First `first`, then this.

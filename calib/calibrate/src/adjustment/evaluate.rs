@@ -22,11 +22,12 @@ impl Evaluation {
         for sighting in &problem.sightings {
             let camera_from_board = problem.cameras[sighting.camera]
                 .camera_from_rig
-                .after(&problem.rig_from_board[sighting.view]);
+                .after(&problem.rig_from_board[sighting.view])
+                .affine();
             let mut of_sighting = Vec::with_capacity(sighting.corners.len());
             for corner in &sighting.corners {
                 let point = shape.bent(corner.point, problem.warp);
-                let pixel = cameras[sighting.camera].project(camera_from_board.transform(point))?;
+                let pixel = cameras[sighting.camera].project(camera_from_board.transform_point3(point))?;
                 let residual = pixel - corner.pixel;
                 cost += loss(residual, huber_px);
                 of_sighting.push(residual);

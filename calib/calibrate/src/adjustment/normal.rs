@@ -5,7 +5,7 @@ use super::{INTRINSIC_PARAMETERS, Layout, Problem};
 use crate::rigid::by_motion;
 use depthrig_calib::Camera;
 use glam::DMat3;
-use nalgebra::{Cholesky, DMatrix, DVector, Dyn, Matrix6, SMatrix, Vector6};
+use nalgebra::{Cholesky, DMatrix, DVector, Dyn, Matrix6, Vector6};
 
 /// Unknowns of a camera at the most, those of the board's shape, and those of a view.
 const ROW: usize = INTRINSIC_PARAMETERS + 6 + 2;
@@ -35,7 +35,7 @@ pub(super) struct Step {
 /// One row of the Jacobian: the sparse part of the shared unknowns, and the view's.
 struct Row {
     shared: [f64; ROW],
-    view: Vector6<f64>,
+    view: [f64; 6],
     residual: f64,
 }
 
@@ -84,13 +84,17 @@ impl Normal {
         }
         let used = places.len();
         // Summed here without the places, once for all corners: the matrices are touched once for a sighting.
-        let mut square = SMatrix::<f64, ROW, ROW>::zeros();
-        let mut cross = SMatrix::<f64, ROW, 6>::zeros();
+        let mut square = [[0.0; ROW]; ROW];
+        let mut cross = [[0.0; 6]; ROW];
         let mut gradient = [0.0; ROW];
+        let mut own = [[0.0; 6]; 6];
+        let mut own_gradient = [0.0; 6];
         let view = &mut self.views[sighting.view];
+        let board = rig_from_board.affine();
+        let pose = camera.camera_from_rig.affine();
         for corner in &sighting.corners {
-            let in_rig = rig_from_board.transform(shape.bent(corner.point, problem.warp));
-            let in_camera = camera.camera_from_rig.transform(in_rig);
+            let in_rig = board.transform_point3(shape.bent(corner.point, problem.warp));
+            let in_camera = pose.transform_point3(in_rig);
             let Some(projection) = lens.project_with_jacobian(in_camera) else { continue };
             let residual = projection.pixel - corner.pixel;
             let root = weight(residual, huber_px).sqrt();
@@ -99,7 +103,7 @@ impl Normal {
                 let d_rig = rig_from_camera * d_camera;
                 let mut row = Row {
                     shared: [0.0; ROW],
-                    view: by_motion(in_rig, d_rig) * root,
+                    view: (by_motion(in_rig, d_rig) * root).into(),
                     residual: residual[axis] * root,
                 };
                 for (k, parameter) in free.iter().enumerate() {
@@ -119,26 +123,33 @@ impl Normal {
                     row.shared[next] = by_z * by_warp.x;
                     row.shared[next + 1] = by_z * by_warp.y;
                 }
+                // Plain arrays, row by row, so that the compiler makes vectors of the inner loops.
                 for i in 0..used {
                     let value = row.shared[i];
-                    for j in 0..=i {
-                        square[(i, j)] += value * row.shared[j];
+                    for (sum, by) in square[i].iter_mut().zip(&row.shared[..=i]) {
+                        *sum += value * by;
                     }
-                    for j in 0..6 {
-                        cross[(i, j)] += value * row.view[j];
+                    for (sum, by) in cross[i].iter_mut().zip(&row.view) {
+                        *sum += value * by;
                     }
                     gradient[i] += value * row.residual;
                 }
-                view.own += row.view * row.view.transpose();
-                view.gradient += row.view * row.residual;
+                for i in 0..6 {
+                    for (sum, by) in own[i].iter_mut().zip(&row.view) {
+                        *sum += row.view[i] * by;
+                    }
+                    own_gradient[i] += row.view[i] * row.residual;
+                }
             }
         }
+        view.own += Matrix6::from_fn(|i, j| own[i][j]);
+        view.gradient += Vector6::from(own_gradient);
         for (i, at) in places.iter().enumerate() {
             for (j, other) in places.iter().enumerate() {
-                self.shared[(*at, *other)] += if j <= i { square[(i, j)] } else { square[(j, i)] };
+                self.shared[(*at, *other)] += if j <= i { square[i][j] } else { square[j][i] };
             }
             for j in 0..6 {
-                view.cross[(*at, j)] += cross[(i, j)];
+                view.cross[(*at, j)] += cross[i][j];
             }
             self.gradient[*at] += gradient[i];
         }
