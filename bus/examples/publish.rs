@@ -217,6 +217,7 @@ fn distinct() -> FrameHeader {
         source_color_sequence: 0xA1A2_A3A4_A5A6_A7A8,
         source_color_capture_time_ns: -0x2122_2324_2526_2728,
         stage_ns: [201, 202, 203, 204, 205, 206],
+        latency_ns: 0xB1B2_B3B4_B5B6_B7B8,
         ..FrameHeader::default()
     };
     header.rig = text("rig-µ");
@@ -261,7 +262,7 @@ fn dump(folder: &Path) -> Result<(), Box<dyn Error>> {
         "model": h.model(), "serial": h.serial(),
         "source_color_sequence": h.source_color_sequence,
         "source_color_capture_time_ns": h.source_color_capture_time_ns, "stage_ns": h.stage_ns,
-        "refiner": h.refiner(), "refiner_model": h.refiner_model(), "reserved": h.reserved,
+        "refiner": h.refiner(), "refiner_model": h.refiner_model(), "latency_ns": h.latency_ns, "reserved": h.reserved,
     });
     std::fs::create_dir_all(folder)?;
     std::fs::write(folder.join("header.bin"), bytes)?;

@@ -118,8 +118,11 @@ pub struct FrameHeader {
     pub refiner: [u8; 32],
     /// The model that it used, such as `cdm-d435@1f2e3d4c`, zero-padded UTF-8; empty when it needs none.
     pub refiner_model: [u8; 32],
+    /// Constant latency of the delivery that `capture_time_ns` is free of, nanoseconds; 0 when none is known. How it is known is in
+    /// the flags [`FrameFlags::LATENCY_MEASURED`] and [`FrameFlags::LATENCY_CALIBRATED`].
+    pub latency_ns: u64,
     /// Zero; space for later fields of this version.
-    pub reserved: [u64; 13],
+    pub reserved: [u64; 12],
 }
 
 const _: () = assert!(size_of::<FrameHeader>() == HEADER_SIZE, "the header's size is part of the contract");
@@ -167,7 +170,8 @@ impl Default for FrameHeader {
             stage_ns: [0; StageStep::ALL.len()],
             refiner: [0; 32],
             refiner_model: [0; 32],
-            reserved: [0; 13],
+            latency_ns: 0,
+            reserved: [0; 12],
         }
     }
 }
@@ -315,9 +319,13 @@ impl FrameFlags {
     pub const HEADER_TIME: Self = Self(1 << 8);
     /// The metadata of this frame alone did not come: its device time is reckoned from when it arrived.
     pub const METADATA_LOST: Self = Self(1 << 9);
+    /// `latency_ns` was measured by asking the device for its clock: the capture time is free of the delivery's latency.
+    pub const LATENCY_MEASURED: Self = Self(1 << 10);
+    /// `latency_ns` comes from a calibration of the mount: the capture time is comparable with those of its other cameras.
+    pub const LATENCY_CALIBRATED: Self = Self(1 << 11);
 
     /// Every flag with its name.
-    pub const ALL: [(&'static str, Self); 10] = [
+    pub const ALL: [(&'static str, Self); 12] = [
         ("replayed", Self::REPLAYED),
         ("time_uncertain", Self::TIME_UNCERTAIN),
         ("clock_warmup", Self::CLOCK_WARMUP),
@@ -328,6 +336,8 @@ impl FrameFlags {
         ("synthetic", Self::SYNTHETIC),
         ("header_time", Self::HEADER_TIME),
         ("metadata_lost", Self::METADATA_LOST),
+        ("latency_measured", Self::LATENCY_MEASURED),
+        ("latency_calibrated", Self::LATENCY_CALIBRATED),
     ];
 
     /// Whether all bits of `flag` are set.

@@ -89,7 +89,8 @@ pub const FIELDS: &[Field] = fields! {
     "stage_ns": stage_ns => "u64" x StageStep::ALL.len();
     "refiner": refiner => "u8" x 32;
     "refiner_model": refiner_model => "u8" x 32;
-    "reserved": reserved => "u64" x 13;
+    "latency_ns": latency_ns => "u64" x 1;
+    "reserved": reserved => "u64" x 12;
 };
 
 const _: () = assert!(size_of::<Intrinsics>() == 104 && size_of::<Pose>() == 56);

@@ -22,8 +22,10 @@ fn offsets_of_version_1_never_move() {
             .collect();
     assert_eq!(seen, [8, 48, 96, 176, 280, 348, 376]);
     let derived: Vec<_> =
-        ["source_color_sequence", "stage_ns", "refiner", "refiner_model", "reserved"].map(at).into();
-    assert_eq!(derived, [536, 552, 600, 632, 664]);
+        ["source_color_sequence", "stage_ns", "refiner", "refiner_model", "latency_ns", "reserved"]
+            .map(at)
+            .into();
+    assert_eq!(derived, [536, 552, 600, 632, 664, 672]);
 }
 
 #[test]

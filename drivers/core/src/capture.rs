@@ -3,7 +3,7 @@
 //! Whatever a device does, [`Capture::stop`] returns within its timeout. A thread that does not end by then
 //! is *abandoned*: it is left behind, and if it ever wakes, nothing that it still holds is published.
 
-use crate::clock::ClockQuality;
+use crate::clock::{CalibratedLatency, ClockQuality};
 use crate::{DeviceInfo, Error, ErrorKind, FrameMeta, FrameSink, Loan, Poll, Result, Stream};
 use core::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 use core::time::Duration;
@@ -258,6 +258,10 @@ impl FrameSink for Guarded<'_> {
 
     fn clock_quality(&mut self, stream: usize, quality: &ClockQuality) {
         self.sink.clock_quality(stream, quality);
+    }
+
+    fn calibrated_latency(&self, stream: usize) -> Option<CalibratedLatency> {
+        self.sink.calibrated_latency(stream)
     }
 }
 

@@ -33,7 +33,7 @@ use hull::{Hull, Line, Point};
 use judge::Verdict;
 use probe::{Latency, Probes};
 use trust::{Residuals, Trust};
-pub use types::{ClockConfig, ClockQuality, Mapped};
+pub use types::{CalibratedLatency, ClockConfig, ClockQuality, Mapped};
 use unwrap::Counter;
 
 /// Arrivals this far below the line cannot be luck: a clock stepped.
@@ -131,7 +131,7 @@ impl ClockMap {
             trust: Trust::new(),
             claim_ns: 0.0,
             probes: Probes::default(),
-            latency: known.then_some(Latency { ns: config.latency_ns, bound_ns: 0 }),
+            latency: known.then_some(Latency { ns: config.latency_ns, bound_ns: config.latency_bound_ns }),
             is_carried: false,
             is_asked: false,
             shown_latency: config.latency_ns as f64,
@@ -172,11 +172,41 @@ impl ClockMap {
             },
         };
         let changed = epochs_before > 0 && self.epochs != epochs_before;
-        let mapped = Mapped { flags: mapped.flags.with(epoch_changed(changed)), ..mapped };
+        let flags = mapped.flags.with(epoch_changed(changed)).with(self.latency_flags());
+        let mapped = Mapped { flags, ..mapped };
         self.last_capture = mapped.capture_time;
         self.late += u64::from(mapped.flags.0 & FrameFlags::LATE.0 != 0);
         self.uncertain += u64::from(mapped.flags.0 & FrameFlags::TIME_UNCERTAIN.0 != 0);
         mapped
+    }
+
+    /// Takes the latency that a calibration found, as if it had been configured. Probes replace it, so that a latency is never
+    /// subtracted twice. Called before the first frame; afterwards the published times approach it slowly.
+    pub fn calibrate(&mut self, latency: CalibratedLatency) {
+        let config =
+            ClockConfig { latency_ns: latency.ns, latency_bound_ns: latency.bound_ns, ..self.config };
+        self.config = config.in_range();
+        if !self.is_measured() {
+            let Self { config, .. } = self;
+            self.latency = Some(Latency { ns: config.latency_ns, bound_ns: config.latency_bound_ns });
+        }
+        if self.epochs == 0 {
+            self.shown_latency = self.latency.map_or(0.0, |l| l.ns as f64);
+        }
+    }
+
+    /// Whether the latency comes from probes.
+    fn is_measured(&self) -> bool {
+        self.is_carried || !self.probes.is_empty()
+    }
+
+    /// How the latency is known, for the frames' flags.
+    fn latency_flags(&self) -> FrameFlags {
+        match self.latency {
+            _ if self.is_measured() => FrameFlags::LATENCY_MEASURED,
+            Some(_) => FrameFlags::LATENCY_CALIBRATED,
+            None => FrameFlags(0),
+        }
     }
 
     /// Announces that probes of this device will come. Until the first one, its frames carry
@@ -411,7 +441,7 @@ impl ClockMap {
         if backward {
             uncertainty += seen.arrival.since_ns(capture) as f64;
         }
-        let unanswered = self.is_asked && self.latency.is_none();
+        let unanswered = self.is_asked && !self.is_measured();
         if unanswered
             || backward
             || epoch.frames <= DECIDING_FRAMES as u64
@@ -430,6 +460,7 @@ impl ClockMap {
             uncertainty_ns: uncertainty as u64,
             epoch: self.epochs - 1,
             flags,
+            latency_ns: self.shown_latency.max(0.0).round() as u64,
         }
     }
 }

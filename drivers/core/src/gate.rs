@@ -6,7 +6,7 @@
 //! - delivered frames have strictly rising unwrapped device sequence numbers within one clock epoch;
 //! - capture times never go back within one clock epoch, and never lie after the arrival.
 
-use crate::clock::{ClockConfig, ClockMap};
+use crate::clock::{CalibratedLatency, ClockConfig, ClockMap};
 use crate::{FrameMeta, FrameSink, Loan, StreamProfile};
 use depthrig_bus::{ClockDomain, DropCounts, DropReason, FrameFlags, HostTime, PixelFormat};
 
@@ -93,6 +93,10 @@ pub struct Gate {
     last_capture: HostTime,
     /// Frames between two reports of the clock's quality: about a second's worth.
     report_every: u64,
+    /// The receiver was asked for the stream's latency.
+    is_asked: bool,
+    /// The receiver's answer.
+    latency: Option<CalibratedLatency>,
 }
 
 impl Gate {
@@ -116,6 +120,8 @@ impl Gate {
             drops: DropCounts::default(),
             last_capture: HostTime::from_ns(i64::MIN),
             report_every: (profile.rate_hz.ceil() as u64).max(1),
+            is_asked: false,
+            latency: None,
         }
     }
 
@@ -207,6 +213,7 @@ impl Gate {
         let Some(device_sequence) = self.account(raw, sink) else {
             return Outcome::AlreadyCounted;
         };
+        self.ask_latency(sink);
         let passed = device_sequence.and_then(|sequence| {
             self.check(raw)?;
             let meta = FrameMeta { captured: self.captured, ..self.stamp(raw, sequence) };
@@ -221,6 +228,17 @@ impl Gate {
         }
         self.delivered += 1;
         Outcome::Delivered
+    }
+
+    /// Asks once for the latency that a calibration found.
+    fn ask_latency(&mut self, sink: &dyn FrameSink) {
+        if core::mem::replace(&mut self.is_asked, true) {
+            return;
+        }
+        self.latency = sink.calibrated_latency(self.stream);
+        if let Some(latency) = self.latency {
+            self.clock.calibrate(latency);
+        }
     }
 
     /// Checks that the frame is complete and undamaged.
@@ -253,6 +271,7 @@ impl Gate {
             exposure_ns: raw.exposure_ns,
             gain: raw.gain,
             temperature_c: raw.temperature_c,
+            latency_ns: 0,
         };
         if self.domain == ClockDomain::Device {
             let mapped = self.clock.observe(raw.device_ticks, device_sequence, raw.arrival);
@@ -261,10 +280,22 @@ impl Gate {
             meta.capture_uncertainty_ns = mapped.uncertainty_ns;
             meta.clock_epoch = mapped.epoch;
             meta.flags = meta.flags.with(mapped.flags);
-        } else if self.domain == ClockDomain::Kernel {
-            // The counter is the kernel's monotonic stamp in nanoseconds, taken as it is.
-            meta.capture_time =
-                HostTime::from_ns(raw.device_ticks as i64).min(raw.arrival).max(self.last_capture);
+            meta.latency_ns = mapped.latency_ns;
+        } else {
+            let latency_ns = self.latency.map_or(0, |l| l.ns.max(0));
+            if let Some(latency) = self.latency {
+                meta.flags = meta.flags.with(FrameFlags::LATENCY_CALIBRATED);
+                meta.latency_ns = latency_ns as u64;
+                meta.capture_uncertainty_ns = latency.bound_ns.max(0) as u64;
+            }
+            // With the kernel's domain the counter is its monotonic stamp in nanoseconds, taken as it is.
+            let stamp = match self.domain {
+                ClockDomain::Kernel => HostTime::from_ns(raw.device_ticks as i64).min(raw.arrival),
+                _ => raw.arrival,
+            };
+            if latency_ns > 0 || self.domain == ClockDomain::Kernel {
+                meta.capture_time = stamp.plus_ns(-latency_ns).max(self.last_capture);
+            }
         }
         self.last_capture = meta.capture_time;
         meta

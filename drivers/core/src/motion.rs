@@ -175,6 +175,7 @@ impl Batcher {
                 exposure_ns: 0,
                 gain: 0.0,
                 temperature_c: newest.temperature_c,
+                latency_ns: 0,
             },
         );
         true

@@ -1,6 +1,6 @@
 //! Where a driver's frames go: memory on loan, written once, then committed or given back.
 
-use crate::clock::ClockQuality;
+use crate::clock::{CalibratedLatency, ClockQuality};
 use depthrig_bus::{ClockDomain, DropCounts, DropReason, FrameFlags, FrameMut, HostTime};
 
 /// The receiver of a camera's frames. `stream` is the index into [`crate::Stream::profiles`].
@@ -45,6 +45,11 @@ pub trait FrameSink {
 
     /// Says how the clock map of `stream` is doing, about once a second.
     fn clock_quality(&mut self, stream: usize, quality: &ClockQuality);
+
+    /// Constant latency of `stream`, where a calibration of the mount has found it. The gate asks before the first frame.
+    fn calibrated_latency(&self, _stream: usize) -> Option<CalibratedLatency> {
+        None
+    }
 }
 
 /// Memory for one frame that is the driver's until it is committed or dropped, so that a device can fill several at
@@ -94,6 +99,8 @@ pub struct FrameMeta {
     pub gain: f32,
     /// Sensor temperature in °C; NaN when unknown.
     pub temperature_c: f32,
+    /// Constant latency that the capture time is free of, nanoseconds; 0 when none is known.
+    pub latency_ns: u64,
 }
 
 /// A sink that keeps everything in memory, for tests and tools.
@@ -107,6 +114,8 @@ pub struct MemorySink {
     pub captured: Vec<u64>,
     /// Number of loans from now on that are refused, as if no slot were free.
     pub refuse: usize,
+    /// Latency of every stream, as a calibration would have found it.
+    pub latency: Option<CalibratedLatency>,
     lends: bool,
     buffers: Vec<Vec<u8>>,
 }
@@ -179,4 +188,8 @@ impl FrameSink for MemorySink {
     }
 
     fn clock_quality(&mut self, _: usize, _: &ClockQuality) {}
+
+    fn calibrated_latency(&self, _: usize) -> Option<CalibratedLatency> {
+        self.latency
+    }
 }

@@ -149,6 +149,8 @@ class FrameFlags(enum.IntFlag):
     SYNTHETIC = 128
     HEADER_TIME = 256
     METADATA_LOST = 512
+    LATENCY_MEASURED = 1024
+    LATENCY_CALIBRATED = 2048
 
 
 class MotionFlags(enum.IntFlag):
@@ -263,7 +265,8 @@ FIELDS = (
     ("stage_ns", 552, "u64", 6),
     ("refiner", 600, "u8", 32),
     ("refiner_model", 632, "u8", 32),
-    ("reserved", 664, "u64", 13),
+    ("latency_ns", 664, "u64", 1),
+    ("reserved", 672, "u64", 12),
 )
 
 
@@ -607,9 +610,14 @@ class HeaderFields:
         return _text(self._raw[632:664])
 
     @property
+    def latency_ns(self) -> int:
+        """Constant latency of the delivery that `capture_time_ns` is free of, nanoseconds; 0 when none is known. How it is known is in the flags `FrameFlags::LATENCY_MEASURED` and `FrameFlags::LATENCY_CALIBRATED`."""
+        return int(struct.unpack_from("<Q", self._raw, 664)[0])
+
+    @property
     def reserved(self) -> tuple[int, ...]:
         """Zero; space for later fields of this version."""
-        return struct.unpack_from("<13Q", self._raw, 664)
+        return struct.unpack_from("<12Q", self._raw, 672)
 
     def _intrinsics(self) -> IntrinsicsFields:
         return IntrinsicsFields(

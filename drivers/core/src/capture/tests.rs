@@ -105,6 +105,7 @@ fn meta() -> FrameMeta {
         exposure_ns: 0,
         gain: 0.0,
         temperature_c: f32::NAN,
+        latency_ns: 0,
     }
 }
 

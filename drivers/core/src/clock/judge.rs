@@ -83,6 +83,7 @@ impl ClockMap {
             uncertainty_ns: spread_ns as u64,
             epoch: self.epochs.saturating_sub(1),
             flags: FrameFlags::TIME_UNCERTAIN,
+            latency_ns: self.shown_latency.max(0.0).round() as u64,
         }
     }
 }

@@ -505,6 +505,49 @@ fn a_configured_latency_is_subtracted() {
 }
 
 #[test]
+fn a_calibrated_latency_is_subtracted_and_named() {
+    let s = Scenario { seconds: 60.0, ..NOMINAL };
+    let samples = generate(&s, 0);
+    let mut map = ClockMap::new(config_of(&s));
+    map.calibrate(CalibratedLatency { ns: 3_000_000, bound_ns: 50_000 });
+    let outcomes = play(&mut map, &samples);
+    assert!(after(&outcomes, 30.0).all(|o| o.error_ns().abs() < 60e3));
+    assert!(outcomes.iter().all(|o| o.mapped.latency_ns == 3_000_000));
+    assert!(outcomes.iter().all(|o| o.has(FrameFlags::LATENCY_CALIBRATED)));
+    assert!(outcomes.iter().all(|o| !o.has(FrameFlags::LATENCY_MEASURED)));
+    // Its uncertainty is part of what frames claim.
+    let mut plain = ClockMap::new(config_of(&s));
+    let without = play(&mut plain, &samples);
+    assert!(without.iter().all(|o| o.mapped.latency_ns == 0 && !o.has(FrameFlags::LATENCY_CALIBRATED)));
+    let wider = outcomes.iter().zip(&without).filter(|(a, b)| {
+        a.mapped.uncertainty_ns.saturating_sub(b.mapped.uncertainty_ns).abs_diff(50_000) < 1_000
+    });
+    // Of frames that came at once the plain map claims more: they would have been captured after they arrived.
+    assert!(wider.count() * 10 > outcomes.len() * 9);
+}
+
+#[test]
+fn a_camera_that_is_asked_for_its_clock_is_not_corrected_twice() {
+    let s = Scenario { seconds: 60.0, ..NOMINAL };
+    let samples = generate(&s, 0);
+    let mut map = ClockMap::new(config_of(&s));
+    map.calibrate(CalibratedLatency { ns: 5_000_000, bound_ns: 0 });
+    let before = play(&mut map, &samples[..600]);
+    assert!(before.iter().all(|o| o.has(FrameFlags::LATENCY_CALIBRATED)));
+    // The device answers that the latency is what it is: 3 ms.
+    let last = &samples[599];
+    let read = HostTime::from_ns(last.truth_ns as i64);
+    map.probe(read.plus_ns(-10_000), last.raw, read.plus_ns(10_000));
+    let outcomes = play(&mut map, &samples[600..]);
+    assert!(outcomes.iter().all(|o| o.has(FrameFlags::LATENCY_MEASURED)));
+    assert!(after(&outcomes, 30.0).count() > 200);
+    assert!(after(&outcomes, 30.0).all(|o| o.error_ns().abs() < 100e3));
+    assert!(outcomes.last().unwrap().mapped.latency_ns.abs_diff(3_000_000) < 100_000);
+    map.calibrate(CalibratedLatency { ns: 5_000_000, bound_ns: 0 });
+    assert!(map.quality().latency_ns < 3_200_000);
+}
+
+#[test]
 fn restart_counts_on_and_keeps_what_the_crystal_taught() {
     let s = Scenario { seconds: 120.0, rate_ppm: 300.0, ..NOMINAL };
     let samples = generate(&s, 0);

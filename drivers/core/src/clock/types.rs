@@ -19,6 +19,8 @@ pub struct ClockConfig {
     /// Least time from the device's stamp to the arrival, when it is known from elsewhere, nanoseconds; 0 when it
     /// is not.
     pub latency_ns: i64,
+    /// Half-width of the interval around `latency_ns` that holds the truth, nanoseconds.
+    pub latency_bound_ns: i64,
     /// How many frames commonly come together, of which the newest alone is observed; 1 to 4096. What is late, and how
     /// far the line may move from one to the next, is reckoned by so many periods.
     pub bunch: u32,
@@ -27,7 +29,15 @@ pub struct ClockConfig {
 impl ClockConfig {
     /// A window of 60 s, frames that come one by one, and an unknown latency.
     pub fn new(counter_bits: u32, tick_ns: f64, period_ns: u64) -> Self {
-        Self { counter_bits, tick_ns, period_ns, window_ns: 60_000_000_000, latency_ns: 0, bunch: 1 }
+        Self {
+            counter_bits,
+            tick_ns,
+            period_ns,
+            window_ns: 60_000_000_000,
+            latency_ns: 0,
+            latency_bound_ns: 0,
+            bunch: 1,
+        }
     }
 
     /// The same with each value in its range.
@@ -37,9 +47,19 @@ impl ClockConfig {
         self.period_ns = self.period_ns.clamp(1, 3_600_000_000_000);
         self.window_ns = self.window_ns.clamp(10_000_000_000, 120_000_000_000);
         self.latency_ns = self.latency_ns.clamp(0, 10_000_000_000);
+        self.latency_bound_ns = self.latency_bound_ns.clamp(0, 10_000_000_000);
         self.bunch = self.bunch.clamp(1, 4096);
         self
     }
+}
+
+/// A stream's constant latency as a calibration of the mount found it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct CalibratedLatency {
+    /// Nanoseconds; 0 of the camera that the others are compared with.
+    pub ns: i64,
+    /// Half-width of the interval that holds the truth, nanoseconds.
+    pub bound_ns: i64,
 }
 
 /// One frame's time on the host's clock.
@@ -54,8 +74,10 @@ pub struct Mapped {
     pub uncertainty_ns: u64,
     /// Number of the clock map in force.
     pub epoch: u32,
-    /// Any of `TIME_UNCERTAIN`, `CLOCK_WARMUP`, `EPOCH_CHANGED`, `LATE`.
+    /// Any of `TIME_UNCERTAIN`, `CLOCK_WARMUP`, `EPOCH_CHANGED`, `LATE`, `LATENCY_MEASURED`, `LATENCY_CALIBRATED`.
     pub flags: FrameFlags,
+    /// Constant latency that `capture_time` is free of, nanoseconds; 0 when none is known.
+    pub latency_ns: u64,
 }
 
 /// How the map of one device is doing.

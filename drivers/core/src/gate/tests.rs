@@ -138,6 +138,34 @@ fn a_kernel_stamp_is_used_as_it_is() {
     assert_eq!(sink.frames[0].1.capture_time, HostTime::from_ns(999_000_000));
 }
 
+#[test]
+fn a_calibrated_latency_is_subtracted_whatever_the_clock() {
+    for domain in [ClockDomain::Device, ClockDomain::Kernel, ClockDomain::Arrival] {
+        let stamps = |latency: Option<CalibratedLatency>| {
+            let mut gate = Gate::new(0, &profile(32, domain));
+            let mut sink = MemorySink::default();
+            sink.latency = latency;
+            for i in 0..3 {
+                let mut frame = raw(1 + i, i as i64);
+                if domain == ClockDomain::Kernel {
+                    frame.device_ticks = frame.arrival.ns() as u64 - 1_000_000;
+                }
+                feed(&mut gate, &mut sink, &frame);
+            }
+            sink.frames.iter().map(|f| f.1).collect::<Vec<_>>()
+        };
+        let plain = stamps(None);
+        let corrected = stamps(Some(CalibratedLatency { ns: 4_700_000, bound_ns: 60_000 }));
+        for (before, after) in plain.iter().zip(&corrected) {
+            assert_eq!(before.capture_time.since_ns(after.capture_time), 4_700_000, "{domain:?}");
+            assert_eq!((before.latency_ns, after.latency_ns), (0, 4_700_000));
+            assert!(!before.flags.has(FrameFlags::LATENCY_CALIBRATED));
+            assert!(after.flags.has(FrameFlags::LATENCY_CALIBRATED));
+            assert!(after.capture_uncertainty_ns >= before.capture_uncertainty_ns + 60_000);
+        }
+    }
+}
+
 /// One thing a device may do with its counter.
 #[derive(Debug, Clone)]
 enum Step {

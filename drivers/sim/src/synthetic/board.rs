@@ -65,7 +65,7 @@ impl Default for BoardScene {
 }
 
 impl BoardScene {
-    /// What is wrong with its numbers.
+    /// The first of its numbers that is out of range, in words.
     pub(super) fn problem(&self) -> Option<String> {
         let pose = self.displaced.translation_m.iter().chain(&self.displaced.rotation_xyzw);
         if !(0.1..=600.0).contains(&self.hold_s) {
