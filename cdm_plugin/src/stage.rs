@@ -11,7 +11,7 @@ mod view;
 pub use engines::{Installed, Opened, Plan, Refiners, missing};
 pub use header::derived_header;
 pub use settings::{CdmConfig, EngineChoice, RefineConfig, RefineModel};
-pub use view::View;
+pub use view::{Correct, View};
 
 /// The name of the stream of refined depth.
 pub const REFINED: &str = "depth_refined";

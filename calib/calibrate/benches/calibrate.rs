@@ -75,7 +75,7 @@ fn detection(c: &mut Criterion) {
                 board.corner_count()
             );
             group.bench_function(format!("{pattern:?} {width}x{height}"), |b| {
-                b.iter(|| detector.detect(&image))
+                b.iter(|| detector.detect(&image));
             });
         }
     }

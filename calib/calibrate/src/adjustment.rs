@@ -11,12 +11,14 @@ use glam::{DVec2, DVec3};
 
 mod covariance;
 mod evaluate;
+mod information;
 mod normal;
 #[cfg(test)]
 mod tests;
 
 pub use covariance::Covariance;
 use evaluate::Evaluation;
+pub(crate) use information::{Information, Prior, log_determinant};
 use normal::Normal;
 
 /// `fx fy cx cy` and the eight coefficients in the order of [`Intrinsics::coeffs`].

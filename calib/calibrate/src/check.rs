@@ -42,10 +42,10 @@ impl Motion {
 }
 
 /// Chi-squared with six degrees of freedom is above this with a probability of 0.0005.
-const SIGNIFICANT: f64 = 24.1;
+pub(crate) const SIGNIFICANT: f64 = 24.1;
 /// Motions below these are within what temperature does to a mount.
-const MIN_METRES: f64 = 0.5e-3;
-const MIN_RADIANS: f64 = 0.000_9;
+pub(crate) const MIN_METRES: f64 = 0.5e-3;
+pub(crate) const MIN_RADIANS: f64 = 0.000_9;
 
 /// Result of [`check`].
 #[derive(Debug, Clone, PartialEq)]

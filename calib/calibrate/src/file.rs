@@ -9,8 +9,19 @@ use depthrig_calib::{Error, ErrorKind, Result};
 use nalgebra::{Matrix6, Vector6};
 use serde::{Deserialize, Serialize};
 
+mod conditions;
+mod depth;
+mod latency;
 #[cfg(test)]
 mod tests;
+mod worth;
+
+pub use conditions::{Conditions, MAX_TEMPERATURE_CHANGE, lens_position};
+pub use worth::{OLD_DAYS, age_days, old};
+
+pub use latency::FileLatency;
+
+pub use depth::{DepthCorrection, DepthPlace};
 
 /// The version of the file that is written; others are refused.
 pub const FORMAT: &str = "depthrig.calibration/1";
@@ -35,6 +46,9 @@ pub struct Calibration {
     /// The cameras.
     #[serde(rename = "camera")]
     pub cameras: Vec<CalibratedCamera>,
+    /// Corrections of depth.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub depth: Vec<DepthCorrection>,
 }
 
 /// A camera in the file.
@@ -58,8 +72,14 @@ pub struct CalibratedCamera {
     pub intrinsics: FileIntrinsics,
     /// Its pose on the mount: `p_mount = R p_camera + t`, optical axes.
     pub pose: FilePose,
+    /// State that the camera reported meanwhile.
+    #[serde(default, skip_serializing_if = "Conditions::is_empty")]
+    pub conditions: Conditions,
     /// Measures of how good they are.
     pub quality: Quality,
+    /// How late its frames are delivered, once `depthrig calibrate time` has found it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub latency: Option<FileLatency>,
 }
 
 /// Intrinsics in the file, with the names that `rig.toml` has for them.
@@ -158,7 +178,31 @@ impl Calibration {
             rms_px: result.rms_px,
             board: board.clone(),
             cameras: result.cameras.iter().zip(of).map(|(c, of)| CalibratedCamera::new(c, of)).collect(),
+            depth: Vec::new(),
         }
+    }
+
+    /// Takes over from an earlier calibration of the same devices what views of a board at rest do not show: latencies and corrections of
+    /// depth. Returns the cameras, or the cameras' streams, for which there was something.
+    pub fn keep_from(&mut self, before: &Self) -> Vec<String> {
+        let mut kept = Vec::new();
+        for camera in &mut self.cameras {
+            let same = |c: &&CalibratedCamera| {
+                c.name == camera.name && c.stream == camera.stream && c.serial == camera.serial
+            };
+            if let Some(latency) = before.cameras.iter().find(same).and_then(|c| c.latency.clone()) {
+                camera.latency = Some(latency);
+                kept.push(format!("latency of {}", camera.name));
+            }
+        }
+        for correction in &before.depth {
+            let same = |c: &CalibratedCamera| c.name == correction.camera && c.serial == correction.serial;
+            if self.cameras.iter().any(same) {
+                kept.push(format!("depth of {}/{}", correction.camera, correction.stream));
+                self.depth.push(correction.clone());
+            }
+        }
+        kept
     }
 
     /// Reads a file's text.
@@ -181,6 +225,12 @@ impl Calibration {
                 return Err(bad(format!("camera {}: stream {} is there twice", camera.name, camera.stream)));
             }
         }
+        for (i, entry) in found.depth.iter().enumerate() {
+            entry.check()?;
+            if found.depth[..i].iter().any(|d| d.camera == entry.camera && d.stream == entry.stream) {
+                return Err(bad(format!("depth of {}/{} is there twice", entry.camera, entry.stream)));
+            }
+        }
         Ok(found)
     }
 
@@ -196,6 +246,11 @@ impl Calibration {
     /// The entries of a camera.
     pub fn of_camera(&self, name: &str) -> impl Iterator<Item = &CalibratedCamera> {
         self.cameras.iter().filter(move |c| c.name == name)
+    }
+
+    /// The correction of a depth stream.
+    pub fn depth_of(&self, camera: &str, stream: &str) -> Option<&DepthCorrection> {
+        self.depth.iter().find(|d| d.camera == camera && d.stream == stream)
     }
 }
 
@@ -231,6 +286,7 @@ impl CalibratedCamera {
                     .map(|i| core::array::from_fn(|j| camera.pose_covariance[(i, j)]))
                     .collect(),
             },
+            conditions: Conditions::default(),
             quality: Quality {
                 views: camera.views,
                 corners: camera.corners,
@@ -243,6 +299,7 @@ impl CalibratedCamera {
                 halves_differ_mm: halves.and_then(|h| h.pose).map(|p| p.metres * 1e3),
                 halves_differ_deg: halves.and_then(|h| h.pose).map(|p| p.radians.to_degrees()),
             },
+            latency: None,
         }
     }
 
@@ -297,6 +354,9 @@ impl CalibratedCamera {
         }
         if self.pose.translation_m.iter().any(|t| !t.is_finite()) {
             return bad("translation_m is not finite".to_owned());
+        }
+        if let Some(latency) = &self.latency {
+            latency.check()?;
         }
         depthrig_calib::Camera::new(&self.intrinsics()).map(|_| ())
     }

@@ -4,15 +4,19 @@
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
 
 pub mod adjustment;
+pub mod align;
 pub mod board;
 mod board_pose;
+pub mod capture;
 pub mod check;
+pub mod depth;
 pub mod detect;
 pub mod difference;
 pub mod file;
 pub mod hand_eye;
 pub mod homography;
 pub mod intrinsics;
+pub mod latency;
 pub mod mount;
 pub mod rig;
 mod rigid;

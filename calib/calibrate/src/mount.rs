@@ -17,7 +17,9 @@ mod coverage;
 #[cfg(test)]
 mod tests;
 
+pub(crate) use advice::{FEW_SHARED, FEW_VIEWS};
 pub use coverage::Coverage;
+pub(crate) use coverage::NAMES;
 
 /// A camera to calibrate.
 #[derive(Debug, Clone, PartialEq)]
@@ -141,6 +143,8 @@ pub struct ViewResidual {
     pub camera: usize,
     /// Root mean square of the residuals' lengths, pixels.
     pub rms_px: f64,
+    /// Corners that were used.
+    pub corners: usize,
     /// Corners that were left out.
     pub outliers: usize,
 }
@@ -192,8 +196,8 @@ pub fn calibrate_mount(
     Ok(result)
 }
 
-/// The residuals of new intrinsics must be less than this share of the factory's to replace them: a difference that chance makes with some
-/// thousand corners is no reason, and the factory looked at the whole image.
+/// The residuals of new intrinsics must be less than this share of the factory's to replace them: with some thousand corners chance makes
+/// differences of a percent, and the factory looked at the whole image.
 const CLEARLY_LESS: f64 = 0.97;
 
 /// Intrinsics to go on with.
@@ -393,6 +397,7 @@ fn view_results(views: &[RigView], found: &RigResult) -> Vec<ViewResult> {
                     ViewResidual {
                         camera: s.camera,
                         rms_px: (squares / residuals.len().max(1) as f64).sqrt(),
+                        corners: residuals.len(),
                         outliers: found.fit.outliers.iter().filter(|o| o.sighting == i).count(),
                     }
                 })

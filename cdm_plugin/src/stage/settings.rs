@@ -43,6 +43,8 @@ pub struct RefineConfig {
     pub align: bool,
     /// The camera gives depth in the view of colour, whatever calibration says or does not say.
     pub is_aligned: bool,
+    /// Depth is corrected by the mount's calibration before it is refined, and before it is published in the view of colour.
+    pub corrected: bool,
     /// The stream that is refined.
     pub depth: String,
 }
@@ -90,6 +92,7 @@ impl Default for RefineConfig {
             record: false,
             align: false,
             is_aligned: false,
+            corrected: false,
             depth: "depth".to_owned(),
         }
     }

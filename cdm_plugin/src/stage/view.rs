@@ -4,6 +4,20 @@ use super::pixels;
 use crate::stage::RefineConfig;
 use depthrig_bus::{FrameHeader, Intrinsics, Pose};
 use depthrig_calib::{PoseExt, Registration, same_view};
+use std::sync::Arc;
+
+/// Changes counts of depth, whose unit in metres is given.
+pub type CorrectCounts = dyn Fn(&mut [u16], f64) + Send + Sync;
+
+/// Changes counts of depth before they are put into the view of colour.
+#[derive(Clone)]
+pub struct Correct(pub Arc<CorrectCounts>);
+
+impl core::fmt::Debug for Correct {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.write_str("Correct")
+    }
+}
 
 /// Inputs of registration.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -46,9 +60,17 @@ pub struct View {
     registered: Vec<u16>,
     /// Where depth is put that does not lie as it is wanted.
     packed: Vec<u16>,
+    correct: Option<Correct>,
+    /// Where corrected depth is put: the frame itself is read by others.
+    corrected: Vec<u16>,
 }
 
 impl View {
+    /// A view of depth that is corrected first.
+    pub fn corrected_by(correct: Option<Correct>) -> Self {
+        Self { correct, ..Self::default() }
+    }
+
     /// Depth in the view of colour and its unit in metres, or why it is impossible. `config` says whether it is there
     /// already, `color` and `depth` are the headers.
     ///
@@ -66,8 +88,14 @@ impl View {
             let how = pixels::unfit(color, depth).map_or_else(|| how(config, &key), How::Not);
             self.built = Some((key, how));
         }
-        let (raw, unit_m) =
+        let (mut raw, unit_m) =
             pixels::depth(depth, depth_pixels, &mut self.packed).map_err(|e| e.to_string())?;
+        if let Some(Correct(correct)) = &self.correct {
+            self.corrected.clear();
+            self.corrected.extend_from_slice(raw);
+            correct(&mut self.corrected, unit_m);
+            raw = &self.corrected;
+        }
         match &mut self.built {
             Some((_, How::Registered(registration))) => {
                 let pixels = color.width as usize * color.height as usize;
@@ -84,6 +112,7 @@ impl View {
     pub fn last<'a>(&'a self, depth: &FrameHeader, depth_pixels: &'a [u8]) -> Option<&'a [u16]> {
         match &self.built {
             Some((_, How::Registered(_))) => Some(&self.registered),
+            Some((_, How::AsItIs)) if self.correct.is_some() => Some(&self.corrected),
             Some((_, How::AsItIs)) => pixels::in_place(depth, depth_pixels).or(Some(&self.packed)),
             _ => None,
         }

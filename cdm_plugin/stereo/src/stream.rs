@@ -6,7 +6,7 @@ use super::workers::{Event, Product, Workers};
 use super::{COLOR, PREFIXES, StereoOptions};
 use core::time::Duration;
 use depthrig_bus::{DropReason, FrameFlags, HostTime};
-use depthrig_driver::clock::ClockQuality;
+use depthrig_driver::clock::{CalibratedLatency, ClockQuality};
 use depthrig_driver::moments::{Due, FrameSchedule, SetTimes};
 use depthrig_driver::{Error, ErrorKind, FrameMeta, FrameSink, Poll, Result, Stream, StreamProfile};
 use std::sync::Arc;
@@ -427,5 +427,11 @@ impl FrameSink for Tee<'_> {
                 self.sink.clock_quality(made, quality);
             }
         }
+    }
+
+    fn calibrated_latency(&self, stream: usize) -> Option<CalibratedLatency> {
+        let made = || self.pairing.groups.iter().flat_map(|g| g.streams).flatten().next();
+        let receiver = self.own(stream).or_else(|| made().map(|(made, _)| made))?;
+        self.sink.calibrated_latency(receiver)
     }
 }

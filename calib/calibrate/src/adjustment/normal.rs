@@ -11,6 +11,7 @@ use nalgebra::{Cholesky, DMatrix, DVector, Dyn, Matrix6, Vector6};
 const ROW: usize = INTRINSIC_PARAMETERS + 6 + 2;
 
 /// `[A W; Wᵀ V]` and the right-hand side, at one state. `A` is of the unknowns that views share.
+#[derive(Debug, Clone)]
 pub(crate) struct Normal {
     pub(crate) shared: DMatrix<f64>,
     gradient: DVector<f64>,
@@ -18,6 +19,7 @@ pub(crate) struct Normal {
 }
 
 /// The blocks of one board pose.
+#[derive(Debug, Clone)]
 pub(crate) struct ViewBlock {
     /// `V`.
     pub(crate) own: Matrix6<f64>,
@@ -148,8 +150,8 @@ impl Normal {
             for (j, other) in places.iter().enumerate() {
                 self.shared[(*at, *other)] += if j <= i { square[i][j] } else { square[j][i] };
             }
-            for j in 0..6 {
-                view.cross[(*at, j)] += cross[i][j];
+            for (j, value) in cross[i].iter().enumerate() {
+                view.cross[(*at, j)] += value;
             }
             self.gradient[*at] += gradient[i];
         }

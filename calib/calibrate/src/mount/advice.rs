@@ -3,15 +3,17 @@
 use super::{CameraResult, MountResult, Source};
 
 /// Views of a camera below which intrinsics are weak.
-const FEW_VIEWS: usize = 10;
+pub(crate) const FEW_VIEWS: usize = 10;
 /// Views that two cameras must share.
-const FEW_SHARED: usize = 3;
+pub(crate) const FEW_SHARED: usize = 3;
 /// Uncertainty of projection that is worth a remark, pixels.
 const UNCERTAIN_PX: f64 = 1.0;
 /// Corners left out, of all, that are worth a remark.
 const MANY_OUTLIERS: f64 = 0.02;
 /// A view whose residual is this many times the camera's is doubtful.
 const BAD_VIEW: f64 = 3.0;
+/// A view of which more than this share of the corners was left out is wrong as a whole.
+const WRONG_VIEW: f64 = 0.25;
 /// Residuals above this mean that something is wrong, pixels.
 const LARGE_RMS_PX: f64 = 1.0;
 
@@ -72,7 +74,16 @@ fn of_views(result: &MountResult, lines: &mut Vec<String>) {
     for view in &result.views {
         for seen in &view.seen {
             let camera = &result.cameras[seen.camera];
-            if seen.rms_px > BAD_VIEW * camera.rms_px {
+            if seen.outliers as f64 > WRONG_VIEW * (seen.corners + seen.outliers) as f64 {
+                lines.push(format!(
+                    "view {}, {}: {} of {} corners were left out as wrong: the board or the mount moved, or the image is blurred; leave the \
+                     view out",
+                    view.name,
+                    camera.name,
+                    seen.outliers,
+                    seen.corners + seen.outliers
+                ));
+            } else if seen.rms_px > BAD_VIEW * camera.rms_px {
                 lines.push(format!(
                     "view {}, {}: residuals of {:.2} px, {:.1} times those of the other views: the board or the mount moved, or the image is \
                      blurred; leave the view out",

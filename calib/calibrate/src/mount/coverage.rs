@@ -17,7 +17,7 @@ const COLUMNS: usize = 8;
 const ROWS: usize = 6;
 
 /// Parts of the image, for advice.
-const NAMES: [[&str; 3]; 3] = [
+pub(crate) const NAMES: [[&str; 3]; 3] = [
     ["the top left", "the top", "the top right"],
     ["the left", "the middle", "the right"],
     ["the bottom left", "the bottom", "the bottom right"],
@@ -40,6 +40,15 @@ impl Coverage {
     pub fn share(&self) -> f64 {
         let seen = self.corners.iter().filter(|n| **n > 0).count();
         seen as f64 / self.corners.len().max(1) as f64
+    }
+
+    /// Whether `other` has corners where this one names an empty part.
+    pub(crate) fn fills(&self, other: &Self) -> bool {
+        let mut both = self.clone();
+        for (mine, theirs) in both.corners.iter_mut().zip(&other.corners) {
+            *mine += theirs;
+        }
+        both.empty_parts().len() < self.empty_parts().len()
     }
 
     /// Names of the parts of the image, of nine, in which fewer than a third of the cells have a corner.
