@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 mod decode;
+mod filter;
 mod index;
 mod info;
 mod sets;
@@ -16,8 +17,9 @@ pub(crate) use decode::check_stored;
 #[cfg(any(test, feature = "testing"))]
 pub(crate) use decode::color_decodes;
 pub use decode::jpeg_pixels;
+pub use filter::PixelFilter;
 pub use index::SetReader;
-pub use info::{DatasetInfo, MotionInfo, SpreadStats, StreamInfo};
+pub use info::{AttachedCalibration, DatasetInfo, MotionInfo, SpreadStats, StreamInfo};
 pub(crate) use info::{MotionCount, image_chunks};
 pub use sets::{DatasetFrame, DatasetSet, PixelMode, SetRange, Sets};
 pub(crate) use sets::{Kind, kind_of, kinds};
@@ -29,6 +31,7 @@ pub struct Dataset {
     path: PathBuf,
     session: Session,
     segments: Vec<PathBuf>,
+    filter: Option<PixelFilter>,
 }
 
 impl Dataset {
@@ -57,7 +60,13 @@ impl Dataset {
             // A file: one segment on its own.
             Err(_) => {
                 let session = session_of(&*fs, path)?;
-                return Ok(Self { fs, path: path.to_owned(), session, segments: vec![path.to_owned()] });
+                return Ok(Self {
+                    fs,
+                    path: path.to_owned(),
+                    session,
+                    segments: vec![path.to_owned()],
+                    filter: None,
+                });
             }
         };
         let has_session = entries.iter().any(|e| !e.is_dir && e.name == SESSION_FILE);
@@ -75,7 +84,18 @@ impl Dataset {
                 ));
             }
         };
-        Ok(Self { fs, path: path.to_owned(), session, segments })
+        Ok(Self { fs, path: path.to_owned(), session, segments, filter: None })
+    }
+
+    /// The same dataset, read with changed pixels: those of [`DatasetFrame::decoded`] and of [`PixelMode::Decoded`].
+    #[must_use]
+    pub fn filtered(self, filter: PixelFilter) -> Self {
+        Self { filter: Some(filter), ..self }
+    }
+
+    /// The filter through which its pixels are read.
+    pub const fn filter(&self) -> Option<&PixelFilter> {
+        self.filter.as_ref()
     }
 
     /// The session: what was recorded, by whom, with which rig.

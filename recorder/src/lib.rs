@@ -32,6 +32,7 @@ mod msgs;
 pub mod npy;
 mod options;
 mod outside;
+mod recalibrate;
 mod recorder;
 mod recover;
 mod recovered;
@@ -55,8 +56,8 @@ pub use compare::{
     compare, compare_with,
 };
 pub use dataset::{
-    Dataset, DatasetFrame, DatasetInfo, DatasetSet, MotionInfo, PixelMode, SetRange, SetReader, Sets,
-    SpreadStats, StreamInfo, jpeg_pixels,
+    AttachedCalibration, Dataset, DatasetFrame, DatasetInfo, DatasetSet, MotionInfo, PixelFilter, PixelMode,
+    SetRange, SetReader, Sets, SpreadStats, StreamInfo, jpeg_pixels,
 };
 pub use error::{Error, ErrorKind, Result};
 pub use frame::{
@@ -65,6 +66,7 @@ pub use frame::{
 pub use msgs::{Diagnostic, Level, SetCounts, StreamAccount};
 pub use options::{ColorCodec, Compression, DepthCodec, LIVE_LATE_NS, RecorderOptions, live_late_ns};
 pub use outside::check_outside;
+pub use recalibrate::{Recalibrated, Recalibration, recalibrate};
 pub use recorder::{DiskStatus, Progress, Recorder, Resumed, Summary, UtcSource};
 pub use recover::{
     LostBytes, RecoverAction, RecoverOptions, RecoverProgress, RecoverReport, RecoveredSegment, recover,
@@ -73,7 +75,7 @@ pub use recover::{
 pub use select::{Edge, Moment, SetSpan};
 pub use session::{
     Computed, Derived, Edit, FORMAT, MotionRecord, NOTE_MAX_BYTES, Note, Outcome, SESSION_FILE, Session,
-    SessionChanges, StreamRecord, check_name, edit, rename,
+    SessionChanges, StreamCalibration, StreamRecord, UnitCalibration, check_name, edit, rename,
 };
 pub use slice::{SliceOptions, SliceProgress, SliceReport, merge, trim};
 pub use still::{StillFormat, still};

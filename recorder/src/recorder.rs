@@ -90,6 +90,12 @@ struct Begin {
     past: Past,
 }
 
+/// A locked dataset and what is in it.
+struct Held {
+    lock: Option<Box<dyn Send + Sync>>,
+    past: Past,
+}
+
 struct State {
     counts: SetCounts,
     drops: DropLog,
@@ -177,6 +183,35 @@ impl Recorder {
     ) -> Result<(Self, Resumed)> {
         let lock = lock_folder(&*fs, dir)?;
         let past = resume::past(&fs, dir)?;
+        Self::go_on(fs, utc, dir, options, Held { lock, past })
+    }
+
+    /// Adds to a dataset that is finished, or was [recovered](crate::recover) after its recorder was killed. The next set must have a
+    /// greater id and a later tick. For datasets that grow by the set, such as the views of a calibration.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Truncated`] when a segment is unfinished, and as [`Recorder::resume`].
+    pub fn append(
+        fs: Arc<dyn Fs>,
+        utc: UtcSource,
+        dir: &Path,
+        options: RecorderOptions,
+    ) -> Result<(Self, Resumed)> {
+        let lock = lock_folder(&*fs, dir)?;
+        let past = resume::all(&fs, dir)?;
+        // From here on the dataset is unfinished again, also for one who looks after a crash.
+        past.session.save(&*fs, dir)?;
+        Self::go_on(fs, utc, dir, options, Held { lock, past })
+    }
+
+    fn go_on(
+        fs: Arc<dyn Fs>,
+        utc: UtcSource,
+        dir: &Path,
+        options: RecorderOptions,
+        held: Held,
+    ) -> Result<(Self, Resumed)> {
+        let Held { lock, past } = held;
         let free_bytes = free_space(&*fs, dir, &options)?;
         let topics = Topics::new(&past.session, &options);
         make_reserve(&*fs, dir, options.reserve_bytes)?;

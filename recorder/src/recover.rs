@@ -362,9 +362,10 @@ impl Job<'_> {
         for e in entries.iter().filter(|e| !e.is_dir) {
             let ours = e.name == RESERVE_FILE
                 || e.name == SESSION_TMP
-                || e.name
-                    .strip_suffix("recovering")
-                    .is_some_and(|n| segment_number(n.trim_end_matches('.')).is_some());
+                || ["recovering", crate::recalibrate::TEMPORARY].iter().any(|end| {
+                    let name = e.name.strip_suffix(end);
+                    name.is_some_and(|n| segment_number(n.trim_end_matches('.')).is_some())
+                });
             if !ours {
                 continue;
             }

@@ -10,7 +10,8 @@ use std::path::Path;
 mod edit;
 mod limits;
 
-pub use edit::{SessionChanges, check_name, edit, rename};
+pub(crate) use edit::SessionText;
+pub use edit::{SessionChanges, StreamCalibration, UnitCalibration, check_name, edit, rename};
 
 /// The value of `Session::format` that this version writes and reads.
 pub const FORMAT: &str = "depthrig.dataset/1";
@@ -53,6 +54,9 @@ pub struct Session {
     /// The rig's configuration, TOML text.
     #[serde(default)]
     pub rig_config: String,
+    /// The mount's calibration that poses and intrinsics come from, the text of `calibration.toml`; empty without one.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub calibration: String,
     /// The frames of one set should not be further apart than this, nanoseconds: twice what the rig's set window
     /// allows. Without it `verify` checks the spread only against a limit in its options.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -63,6 +67,9 @@ pub struct Session {
     /// Notes of the operator.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub notes: Vec<Note>,
+    /// Firmware of each camera that says it.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub firmware: BTreeMap<String, String>,
     /// Changes after the recording, oldest first.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub history: Vec<Edit>,
@@ -98,6 +105,27 @@ pub struct Edit {
     /// The version of depthrig that changed it.
     #[serde(default)]
     pub depthrig_version: String,
+}
+
+impl Edit {
+    /// The change in words. A calibration is named by the date at which it was made.
+    pub fn text(&self) -> String {
+        match self.field.as_str() {
+            "notes" => format!("note added: {:?}", self.after),
+            "calibration" => format!(
+                "calibration: {} is now {}",
+                calibration_date(&self.before).unwrap_or("none"),
+                calibration_date(&self.after).unwrap_or("none")
+            ),
+            field => format!("{field}: {:?} is now {:?}", self.before, self.after),
+        }
+    }
+}
+
+/// The date in the text of a `calibration.toml`.
+pub(crate) fn calibration_date(text: &str) -> Option<&str> {
+    let line = text.lines().find_map(|l| l.trim_start().strip_prefix("created"))?;
+    Some(line.trim_start().strip_prefix('=')?.trim().trim_matches('"'))
 }
 
 /// The producer of a computed stream, such as depth from two images: in `session.toml` under `[[computed]]`, and in the
@@ -292,9 +320,11 @@ impl Session {
             depthrig_version: env!("CARGO_PKG_VERSION").to_owned(),
             host: rustix::system::uname().nodename().to_string_lossy().into_owned(),
             rig_config: String::new(),
+            calibration: String::new(),
             max_spread_ns: None,
             outcome: None,
             notes: Vec::new(),
+            firmware: BTreeMap::new(),
             history: Vec::new(),
             derived: Vec::new(),
             computed: Vec::new(),
@@ -357,6 +387,13 @@ impl Session {
         self.rig == other.rig
             && self.streams.iter().map(stream).eq(other.streams.iter().map(stream))
             && self.motion.iter().map(unit).eq(other.motion.iter().map(unit))
+    }
+
+    /// Whether streams and IMUs have the intrinsics and poses that those of `other` have.
+    pub(crate) fn is_calibrated_as(&self, other: &Self) -> bool {
+        let stream = |s: &StreamRecord| (s.intrinsics, s.pose);
+        self.streams.iter().map(stream).eq(other.streams.iter().map(stream))
+            && self.motion.iter().map(|u| u.pose).eq(other.motion.iter().map(|u| u.pose))
     }
 
     /// Losses of an import in words, from the table `import`; empty for a recording.

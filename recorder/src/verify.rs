@@ -200,6 +200,11 @@ pub fn verify_watched(
         }
     }
     let stopped = watch.stopped;
+    if let Ok(dataset) = Dataset::open_with(Arc::clone(fs), path) {
+        for stale in crate::recalibrate::not_recalibrated(&dataset) {
+            findings.add(Severity::Broken, SESSION_FILE, None, stale);
+        }
+    }
     walk.finish(outcome.then_some(&session).filter(|_| !stopped), &mut findings);
     Ok(VerifyReport {
         path: path.to_owned(),

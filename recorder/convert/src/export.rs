@@ -254,19 +254,25 @@ pub fn export(
     progress: &mut dyn FnMut(ExportProgress) -> ControlFlow<()>,
 ) -> Result<ExportReport> {
     datasets.iter().try_for_each(|d| depthrig_recorder::check_outside(out, d.path()))?;
+    let filters: Vec<String> =
+        datasets.iter().filter_map(|d| d.filter().map(|f| f.name().to_owned())).collect();
     let sources: Vec<_> = datasets.into_iter().map(Source::new).collect::<Result<_>>()?;
     let plan = exporter.plan(&sources)?;
+    let mut options_written = exporter.options();
+    if let Some(written) = options_written.as_object_mut().filter(|_| !filters.is_empty()) {
+        written.insert("filters".to_owned(), json!(filters));
+    }
     let mut report = ExportReport {
         format: exporter.format().to_owned(),
         depthrig_version: env!("CARGO_PKG_VERSION").to_owned(),
-        options: exporter.options(),
+        options: options_written,
         datasets: sources.iter().map(|s| s.identity(fs)).collect::<Result<_>>()?,
         streams: Vec::new(),
         sets: 0,
         frames: 0,
         files: 0,
         bytes: 0,
-        losses: plan.losses.iter().cloned().chain(sources.iter().filter_map(motion)).collect(),
+        losses: plan.losses.iter().cloned().chain(sources.iter().filter_map(motion)).chain(filters).collect(),
         counters: std::collections::BTreeMap::new(),
         lost: 0,
         problems: Vec::new(),

@@ -8,7 +8,7 @@
 //!
 //! An [`Importer`] reads one layout and is driven by [`import`], which records a dataset and verifies it.
 //!
-//! Layer 4. [`kinect`] reads recordings of an Azure Kinect; [`relabel`](mod@relabel) and [`zed_replay`](mod@zed_replay) add
+//! Layer 4. [`kinect`] reads recordings of an Azure Kinect; [`recalibrate`] plans another calibration of a dataset; [`relabel`](mod@relabel) and [`zed_replay`](mod@zed_replay) add
 //! depth to datasets.
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
 
@@ -20,6 +20,7 @@ pub mod fuzzing;
 mod import;
 pub mod kinect;
 pub mod lerobot;
+pub mod recalibrate;
 pub mod relabel;
 mod report;
 mod rosbag;

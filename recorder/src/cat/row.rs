@@ -184,6 +184,7 @@ mod tests {
             stored_bytes: 13,
             pixels: Vec::new(),
             jpeg: None,
+            filter: None,
         };
         let set = DatasetSet {
             id: 14,

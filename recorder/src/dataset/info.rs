@@ -4,8 +4,9 @@ use super::{Dataset, PixelMode, SetRange};
 use crate::container::scan::{ChunkEntry, SegmentReader};
 use crate::msgs::accounts;
 use crate::msgs::schemas::Schema;
+use crate::session::calibration_date;
 use crate::{
-    Computed, ErrorKind, MotionRecord, RecordMotion, Result, SetCounts, StreamAccount, StreamRecord,
+    Computed, Edit, ErrorKind, MotionRecord, RecordMotion, Result, SetCounts, StreamAccount, StreamRecord,
 };
 use depthrig_bus::FrameFlags;
 use serde::Serialize;
@@ -51,10 +52,40 @@ pub struct DatasetInfo {
     /// Streams that no camera gave, with what computed them.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub computed: Vec<Computed>,
+    /// The calibration of the mount that its poses come from; `None` without one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub calibration: Option<AttachedCalibration>,
+    /// Changes after the recording, oldest first.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub history: Vec<Edit>,
     /// The last account of the sets in the file.
     pub set_counts: Option<SetCounts>,
     /// The last account of each stream in the file.
     pub accounts: Vec<StreamAccount>,
+}
+
+/// A calibration of the mount, as a dataset carries it.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[non_exhaustive]
+pub struct AttachedCalibration {
+    /// When it was made, as its file says.
+    pub created: String,
+    /// When it was attached to the dataset, UTC nanoseconds since 1970; `None` if the rig had it when it recorded.
+    pub attached_utc_ns: Option<i64>,
+    /// The date of the one before; `None` if it is the first.
+    pub before: Option<String>,
+}
+
+impl AttachedCalibration {
+    fn of(session: &crate::Session) -> Option<Self> {
+        let created = calibration_date(&session.calibration)?.to_owned();
+        let edit = session.history.iter().rev().find(|e| e.field == "calibration");
+        Some(Self {
+            created,
+            attached_utc_ns: edit.map(|e| e.utc_ns),
+            before: edit.and_then(|e| calibration_date(&e.before)).map(str::to_owned),
+        })
+    }
 }
 
 /// How far apart the frames of a set are, nanoseconds.
@@ -86,6 +117,8 @@ pub struct StreamInfo {
     pub stream: String,
     /// Camera model.
     pub model: String,
+    /// Where its calibration comes from.
+    pub calibration: String,
     /// Pixel format on the channel.
     pub format: &'static str,
     /// Pixels per row.
@@ -185,6 +218,7 @@ impl StreamInfo {
         Self {
             stream: s.id.to_string(),
             model: s.model.clone(),
+            calibration: s.calibration.clone(),
             format: s.format.name(),
             width: s.width,
             height: s.height,
@@ -234,6 +268,8 @@ pub(super) fn gather(dataset: &Dataset) -> Result<DatasetInfo> {
         streams: Vec::new(),
         motion: Vec::new(),
         computed: session.computed.clone(),
+        calibration: AttachedCalibration::of(session),
+        history: session.history.clone(),
         set_counts: None,
         accounts: Vec::new(),
     };
@@ -306,6 +342,7 @@ pub(super) fn gather(dataset: &Dataset) -> Result<DatasetInfo> {
             info.problems.push(e.to_string());
         }
     }
+    info.problems.extend(crate::recalibrate::not_recalibrated(dataset));
     Ok(info)
 }
 

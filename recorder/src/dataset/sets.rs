@@ -1,6 +1,6 @@
 //! The sets of a dataset one after the other.
 
-use super::{Dataset, decode};
+use super::{Dataset, PixelFilter, decode};
 use crate::container::scan::{ChannelInfo, ChunkEntry, SegmentReader};
 use crate::encode::Codec;
 use crate::msgs::frame_set::FrameSetMsg;
@@ -98,6 +98,8 @@ pub struct DatasetFrame {
     pub pixels: Vec<u8>,
     /// The JPEG that the pixels were decoded from, with [`PixelMode::DecodedAndStored`].
     pub jpeg: Option<Vec<u8>>,
+    /// Of its dataset, for pixels that are not decoded yet.
+    pub(crate) filter: Option<PixelFilter>,
 }
 
 impl DatasetFrame {
@@ -107,7 +109,12 @@ impl DatasetFrame {
     /// [`ErrorKind::Codec`] when it cannot be decoded.
     pub fn decoded(&self) -> Result<Vec<u8>> {
         let unknown = || Error::new(ErrorKind::Version, format!("codec \"{}\" is unknown here", self.codec));
-        decode::decode(&self.pixels, Codec::from_name(self.codec).ok_or_else(unknown)?, &self.header)
+        let codec = Codec::from_name(self.codec).ok_or_else(unknown)?;
+        let mut pixels = decode::decode(&self.pixels, codec, &self.header)?;
+        if let Some(filter) = &self.filter {
+            filter.apply(&self.header, &mut pixels)?;
+        }
+        Ok(pixels)
     }
 }
 
@@ -346,13 +353,20 @@ fn assemble(
             }
             let stored = decode::stored(&image, codec)?;
             jpeg = (mode == PixelMode::DecodedAndStored && codec == Codec::Jpeg).then(|| stored.to_vec());
-            match mode {
-                PixelMode::Stored => stored.to_vec(),
-                _ => decode::decode(stored, codec, &header)?,
+            if mode == PixelMode::Stored {
+                stored.to_vec()
+            } else {
+                let mut pixels = decode::decode(stored, codec, &header)?;
+                if let Some(filter) = dataset.filter() {
+                    filter.apply(&header, &mut pixels)?;
+                }
+                pixels
             }
         };
         let stored_bytes = member.message_bytes;
-        frames.push(DatasetFrame { stream, header, codec: codec.name(), stored_bytes, pixels, jpeg });
+        let filter = dataset.filter().filter(|_| mode == PixelMode::Stored).cloned();
+        let codec = codec.name();
+        frames.push(DatasetFrame { stream, header, codec, stored_bytes, pixels, jpeg, filter });
     }
     let batches = partial.batches.into_iter().filter(|b| b.log_time == log_time);
     let motion = batches.map(|b| batch(b, set.id, dataset)).collect::<Result<_>>()?;

@@ -29,7 +29,7 @@ pub(crate) fn write(buf: &mut Vec<u8>, h: &FrameHeader, extra: &Extra<'_>) {
     w.f32(h.gain).f32(h.temperature_c);
     w.raw(&h.rig).raw(&h.camera).raw(&h.stream).raw(&h.model).raw(&h.serial);
     w.u64(h.source_color_sequence).i64(h.source_color_capture_time_ns).u64s(&h.stage_ns);
-    w.raw(&h.refiner).raw(&h.refiner_model).u64s(&h.reserved);
+    w.raw(&h.refiner).raw(&h.refiner_model).u64(h.latency_ns).u64s(&h.reserved);
     w.time(extra.stamp_utc_ns).str(extra.frame_id).str(extra.codec);
 }
 
@@ -84,6 +84,7 @@ pub(crate) fn read(message: &[u8]) -> Result<(FrameHeader, Extra<'_>)> {
         stage_ns: r.array(Reader::u64)?,
         refiner: r.array(Reader::u8)?,
         refiner_model: r.array(Reader::u8)?,
+        latency_ns: r.u64()?,
         reserved: r.array(Reader::u64)?,
     };
     let extra = Extra { stamp_utc_ns: r.time()?, frame_id: r.str()?, codec: r.str()? };

@@ -56,6 +56,24 @@ impl Past {
         }
     }
 
+    fn read(&mut self, dataset: &Dataset) -> Result<()> {
+        for set in dataset.sets_with(SetRange::ALL, PixelMode::None) {
+            let set = set?;
+            self.sets += 1;
+            self.frames += set.frames.len() as u64;
+            self.last_id = Some(set.id);
+            for batch in &set.motion {
+                self.last_batches[batch.unit] = Some(batch.header.sequence);
+            }
+            self.last_log_time = set.utc_ns;
+            let offset = set.tick.ns().saturating_add(set.utc_offset_ns);
+            self.anchor.get_or_insert(UtcPair { mono: set.tick, utc_ns: offset, width_ns: 0 });
+            self.first_tick.get_or_insert(set.tick);
+            self.last_tick = Some(set.tick);
+        }
+        Ok(())
+    }
+
     pub(super) const fn resumed(&self) -> Resumed {
         Resumed { sets: self.sets, frames: self.frames, last_set: self.last_id }
     }
@@ -106,20 +124,24 @@ pub(super) fn past(fs: &Arc<dyn Fs>, dir: &Path) -> Result<Past> {
             return Ok(past);
         }
     };
-    for set in dataset.sets_with(SetRange::ALL, PixelMode::None) {
-        let set = set?;
-        past.sets += 1;
-        past.frames += set.frames.len() as u64;
-        past.last_id = Some(set.id);
-        for batch in &set.motion {
-            past.last_batches[batch.unit] = Some(batch.header.sequence);
+    past.read(&dataset)?;
+    Ok(past)
+}
+
+/// Reads all segments of a dataset, without images; its session is then that of an unfinished one.
+pub(super) fn all(fs: &Arc<dyn Fs>, dir: &Path) -> Result<Past> {
+    let dataset = Dataset::open_with(Arc::clone(fs), dir)?;
+    let session = Session { outcome: None, ..Session::load(&**fs, dir)? };
+    let mut past = Past { segments: dataset.segments().len() as u32, ..Past::new(session) };
+    for path in dataset.segments() {
+        if path.extension().is_some_and(|e| e == "part") {
+            let message =
+                format!("{} was not finished; run: depthrig recover {}", path.display(), dir.display());
+            return Err(Error::new(ErrorKind::Truncated, message));
         }
-        past.last_log_time = set.utc_ns;
-        let offset = set.tick.ns().saturating_add(set.utc_offset_ns);
-        past.anchor.get_or_insert(UtcPair { mono: set.tick, utc_ns: offset, width_ns: 0 });
-        past.first_tick.get_or_insert(set.tick);
-        past.last_tick = Some(set.tick);
+        past.bytes += fs.open(path).and_then(|f| f.size()).unwrap_or(0);
     }
+    past.read(&dataset)?;
     Ok(past)
 }
 

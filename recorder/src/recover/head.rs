@@ -12,7 +12,7 @@ use crate::dataset::segment_number;
 use crate::encode::Codec;
 use crate::fs::Fs;
 use crate::msgs::frame_info;
-use crate::recorder::topics::{SESSION_METADATA, Topics, image_channel};
+use crate::recorder::topics::{SEGMENT_METADATA, SESSION_METADATA, Topics, image_channel};
 use crate::{ColorCodec, DepthCodec, RecorderOptions, Result, Session};
 use std::path::{Path, PathBuf};
 
@@ -97,6 +97,8 @@ impl HeadSearch<'_> {
             let other = SegmentReader::open_any(self.fs, other)?;
             let Some(mut head) = proven_head(&other)? else { continue };
             if session_in(&head.preamble, &other).is_some_and(|s| s.has_streams_of(session)) {
+                // What an empty segment says of itself at its end has no chunk before it either.
+                head.preamble.metadata.retain(|(name, _)| name != SEGMENT_METADATA);
                 for (_, map) in head.preamble.metadata.iter_mut().filter(|(name, _)| name == SESSION_METADATA)
                 {
                     map.insert("segment".to_owned(), number.unwrap_or_default().to_string());

@@ -37,11 +37,13 @@ pub(super) fn choose(job: &mut Job<'_>, segments: &[PathBuf]) -> Result<Chosen> 
         let Some(head) = proven_head(&reader)? else { continue };
         let Some(said) = session_in(&head.preamble, &reader) else { continue };
         let better = broken_session(&said).is_empty() && !broken_session(&stored).is_empty();
-        if !better && stored.has_streams_of(&said) {
+        // One that another calibration was attached to is completed by attaching it again.
+        let is_other_calibration = stored.calibration == said.calibration && !stored.is_calibrated_as(&said);
+        if !better && stored.has_streams_of(&said) && !is_other_calibration {
             break;
         }
         let words = format!(
-            "{SESSION_FILE} named another rig or other streams than its segments and was mended from {}",
+            "{SESSION_FILE} named another rig, other streams or another calibration than its segments and was mended from {}",
             file_name(path)
         );
         stored.rig = said.rig;

@@ -121,6 +121,7 @@ fn head(out: &mut String, r: &Report) {
     named_list(out, "Computed, not captured", r.computed.iter().map(ToString::to_string).collect());
     let edits = r.history.iter().map(|e| match e.field.as_str() {
         "notes" => format!("{}: note added: {}", utc_text(e.utc_ns), e.after),
+        "calibration" => format!("{}: {}", utc_text(e.utc_ns), e.text()),
         field => format!("{}: {field} “{}” became “{}”", utc_text(e.utc_ns), e.before, e.after),
     });
     named_list(out, "Changed after the recording", edits.collect());

@@ -11,6 +11,10 @@ use depthrig_bus::UtcPair;
 use std::path::{Path, PathBuf};
 use toml_edit::{ArrayOfTables, DocumentMut, InlineTable, Item, Table, Value};
 
+mod calibration;
+
+pub use calibration::{StreamCalibration, UnitCalibration};
+
 /// Longest name of a dataset, bytes: file systems allow 255, and a suffix must fit.
 const NAME_MAX_BYTES: usize = 240;
 
@@ -102,7 +106,7 @@ pub fn check_name(name: &str) -> Result<()> {
 }
 
 /// A `session.toml` being edited.
-struct SessionText<'a> {
+pub(crate) struct SessionText<'a> {
     fs: &'a dyn Fs,
     path: PathBuf,
     document: DocumentMut,
@@ -113,7 +117,7 @@ struct SessionText<'a> {
 }
 
 impl<'a> SessionText<'a> {
-    fn open(fs: &'a dyn Fs, dir: &Path) -> Result<Self> {
+    pub(crate) fn open(fs: &'a dyn Fs, dir: &Path) -> Result<Self> {
         let lock = fs.lock(dir);
         let entries = fs.read_dir(dir).map_err(|e| Error::reading("open", dir, e))?;
         let part = |p: &PathBuf| p.extension().is_some_and(|e| e == "part");
@@ -223,7 +227,7 @@ impl<'a> SessionText<'a> {
     }
 
     /// Replaces the file, if anything changed, after reading the new text as a session.
-    fn save(&mut self) -> Result<Vec<Edit>> {
+    pub(crate) fn save(&mut self) -> Result<Vec<Edit>> {
         if self.edits.is_empty() {
             return Ok(Vec::new());
         }

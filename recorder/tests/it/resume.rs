@@ -4,9 +4,10 @@ use crate::support::*;
 use depthrig_bus::{StreamId, UtcPair};
 use depthrig_recorder::fs::{Fs, MemFs};
 use depthrig_recorder::{
-    CompareOptions, Computed, ErrorKind, Recorder, RecorderOptions, Session, UtcSource, VerifyOptions,
-    compare, verify_with,
+    CompareOptions, Computed, ErrorKind, Recorder, RecorderOptions, RecoverOptions, Session, UtcSource,
+    VerifyOptions, compare, recover_with, verify_with,
 };
+use std::ops::ControlFlow;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -178,4 +179,40 @@ fn provenance_is_reported() {
     r.finish().unwrap();
     let report = verify_with(&shared, dir, &VerifyOptions::default()).unwrap();
     assert!(report.findings.iter().any(|f| f.message.contains("no such stream")), "{:?}", report.findings);
+}
+
+/// Finished and added to, killed and added to: every set stays, and the whole is one dataset.
+#[test]
+fn a_finished_dataset_grows() {
+    let whole = MemFs::new();
+    let r = begin(&whole);
+    push(&r, 0..SETS);
+    r.finish().unwrap();
+    for (first, second) in [(0, 3), (1, 2), (5, 8), (9, 16)] {
+        let fs = MemFs::new();
+        let shared: Arc<dyn Fs> = Arc::new(fs.clone());
+        let append = || Recorder::append(Arc::clone(&shared), clock(), &dir(), limits());
+        let r = begin(&fs);
+        push(&r, 0..first);
+        r.finish().unwrap();
+        // Killed: it is recovered before anything is added.
+        let (r, resumed) = append().unwrap();
+        assert_eq!((resumed.sets, resumed.last_set), (first, (first > 0).then_some(first)));
+        push(&r, first..second);
+        drop(r);
+        assert_eq!(append().err().unwrap().kind(), ErrorKind::Truncated);
+        let unfinished = RecoverOptions { unfinished_only: true, ..RecoverOptions::default() };
+        recover_with(&shared, &dir(), &unfinished, &mut |_| ControlFlow::Continue(())).unwrap();
+        let (r, resumed) = append().unwrap();
+        assert_eq!(resumed.sets, second, "{first}: a set was lost");
+        assert_eq!(append().err().unwrap().kind(), ErrorKind::InUse);
+        push(&r, second..SETS);
+        let summary = r.finish().unwrap();
+        assert!(summary.complete, "{:?}", summary.lost);
+        assert_eq!(summary.sets.recorded, SETS);
+        let same = compare(&open(&fs), &open(&whole), &CompareOptions::default()).unwrap();
+        assert!(same.equal, "{first} {second}: {:?}", same.differences);
+        let report = verify_with(&shared, &dir(), &VerifyOptions { decode: true, ..Default::default() });
+        assert!(report.as_ref().is_ok_and(depthrig_recorder::VerifyReport::is_whole), "{report:?}");
+    }
 }
