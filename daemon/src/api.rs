@@ -14,6 +14,7 @@
 //! answered; heads, bodies and answers have time limits, bodies a size limit.
 
 mod allowed;
+mod events;
 mod guard;
 mod limits;
 mod reply;
@@ -22,6 +23,7 @@ mod serve;
 mod socket;
 mod token;
 
+pub use events::{CaptureEvent, MAX_FOLLOWERS};
 pub(crate) use reply::{ErrorBody, kind_of_name};
 pub use routes::{
     Health, HealthReason, LoopRequest, NoteRequest, OPENAPI, ROUTES, RateRequest, Route, StepRequest,

@@ -15,6 +15,7 @@ use depthrig_stereo::{Descriptions, Notice, PREFIXES, SIDES};
 use std::sync::{Arc, Mutex, MutexGuard};
 
 mod calibration;
+pub(crate) use calibration::status as calibration_status;
 mod open;
 mod supervisor;
 

@@ -179,6 +179,14 @@ impl Client {
         self.post("/v1/replay/loop", &LoopRequest { on }, TIMEOUT)
     }
 
+    /// Passes an event of a calibration on to those who follow.
+    ///
+    /// # Errors
+    /// As [`Self::status`], and `NotFound` of a daemon that knows no such events.
+    pub fn calibration_event(&self, event: &api::CaptureEvent) -> Result<()> {
+        self.send("POST", "/v1/calibration/events", Some(self.encode(event)?), TIMEOUT).map(drop)
+    }
+
     /// Asks the daemon to end; it closes a recording before it does.
     ///
     /// # Errors

@@ -26,7 +26,7 @@ pub use stereo::StereoConfig;
 
 use crate::family::{FAMILIES, Family};
 use depthrig_bus::{CameraName, Pose, RigName, StreamName};
-use depthrig_calibrate::file::{CalibratedCamera, Calibration};
+use depthrig_calibrate::file::{CalibratedCamera, Calibration, DepthCorrection, lens_position};
 use depthrig_driver::{StreamProfile, StreamRequest};
 use depthrig_stereo::StereoOptions;
 use std::net::SocketAddr;
@@ -62,6 +62,8 @@ pub struct RigConfig {
     pub cdm: CdmConfig,
     /// Calibration of the mount, absolute: intrinsics and poses found with a board.
     pub calibration: Option<PathBuf>,
+    /// The text of that file; empty until the rig starts.
+    pub calibration_text: String,
     /// The cameras in the order of the file; at least one, names unique.
     pub cameras: Vec<CameraConfig>,
     /// The file's text.
@@ -166,6 +168,8 @@ pub struct CameraConfig {
     pub backend: BackendConfig,
     /// Entries of the mount's calibration; empty until the rig starts.
     pub calibration: Vec<Arc<CameraCalibration>>,
+    /// Corrections of its depth; empty until the rig starts.
+    pub depth: Vec<Arc<DepthCorrection>>,
 }
 
 /// An entry of the mount's calibration.
@@ -173,11 +177,19 @@ pub struct CameraConfig {
 pub struct CameraCalibration {
     /// When it was made.
     pub created: String,
+    /// Position of the lens that the rig file sets now.
+    pub lens_position: Option<i64>,
     /// The entry.
     pub camera: CalibratedCamera,
 }
 
 impl CameraConfig {
+    /// The correction of the depth that is refined, if `[camera.refine]` asks for it.
+    pub fn refined_correction(&self) -> Option<&DepthCorrection> {
+        let refine = self.refine.as_ref().filter(|r| r.corrected)?;
+        self.depth.iter().find(|d| d.stream == refine.depth).map(|d| &**d)
+    }
+
     /// Whether frames of `stream` belong into recordings.
     pub fn records(&self, stream: &StreamName) -> bool {
         self.record.as_ref().is_none_or(|list| list.contains(stream))
@@ -291,22 +303,49 @@ impl RigConfig {
     /// Reads the mount's calibration, if the rig has one, into its cameras.
     ///
     /// # Errors
-    /// `NotFound`, `PermissionDenied` or `BadInput` for a file that cannot be read or is wrong, or that has none of the cameras.
+    /// `NotFound`, `PermissionDenied` or `BadInput` for a file that cannot be read or is wrong, or that has none of the cameras, or no
+    /// correction of depth that a camera asks for.
     pub fn read_calibration(&mut self) -> crate::Result<()> {
+        self.read_calibration_file()?;
+        for camera in &self.cameras {
+            let Some(refine) = camera.refine.as_ref().filter(|r| r.corrected) else { continue };
+            if camera.refined_correction().is_none() {
+                return Err(crate::Error::new(
+                    crate::ErrorKind::BadInput,
+                    format!(
+                        "camera {}: [camera.refine] corrected = true, and the rig's calibration has no correction of {}/{}; `depthrig \
+                         calibrate depth` makes one, and calibration = \"calibration.toml\" in the rig names its file",
+                        camera.name, camera.name, refine.depth
+                    ),
+                ));
+            }
+        }
+        Ok(())
+    }
+
+    fn read_calibration_file(&mut self) -> crate::Result<()> {
         let Some(path) = &self.calibration else { return Ok(()) };
         let shown = path.display();
         let bad = |why: String| crate::Error::new(crate::ErrorKind::BadInput, format!("{shown}: {why}"));
         let text = depthrig_bus::files::read_to_string(path, depthrig_bus::files::TEXT_MAX_BYTES)
             .map_err(|e| ConfigError::unreadable(path, e))?;
         let file = Calibration::from_toml(&text).map_err(|e| bad(e.to_string()))?;
+        self.calibration_text = text;
         let mut used = false;
         for camera in &mut self.cameras {
             let entries = file.of_camera(camera.name.as_str());
+            let lens_position = lens_position(&self.text, camera.name.as_str());
             let entry = |entry: &CalibratedCamera| {
-                Arc::new(CameraCalibration { created: file.created.clone(), camera: entry.clone() })
+                Arc::new(CameraCalibration {
+                    created: file.created.clone(),
+                    lens_position,
+                    camera: entry.clone(),
+                })
             };
             camera.calibration = entries.map(entry).collect();
-            used |= !camera.calibration.is_empty();
+            let corrections = file.depth.iter().filter(|d| d.camera == camera.name.as_str());
+            camera.depth = corrections.map(|d| Arc::new(d.clone())).collect();
+            used |= !camera.calibration.is_empty() || !camera.depth.is_empty();
         }
         if !used {
             let names: Vec<&str> = file.cameras.iter().map(|c| c.name.as_str()).collect();

@@ -4,6 +4,7 @@
 //! finding can be tested on fake facts. Nothing is streamed. A camera that somebody has is left alone.
 
 mod bandwidth;
+mod calibration;
 mod cameras;
 mod clock;
 mod disk;
@@ -25,7 +26,7 @@ pub use plan::{CameraPlan, PlannedStream};
 
 use crate::attached::{Ask, Attached, look};
 use crate::config::RigConfig;
-use depthrig_bus::RuntimeDir;
+use depthrig_bus::{HostTime, RuntimeDir, UtcPair};
 use depthrig_usb::SysRoot;
 use serde::Serialize;
 
@@ -91,6 +92,7 @@ fn judge(config: &RigConfig, attached: &Attached, plans: Vec<plan::Planned>, hos
     let shm_needed_bytes = memory::check(config, &plans, host, &mut findings);
     host.check(config, &mut findings);
     refine::check(config, &plans, &mut findings);
+    calibration::check(config, UtcPair::sample().utc_ns(HostTime::now()), &mut findings);
     host.check_unmet(&mut findings);
     findings.sort_by_key(|f| (core::cmp::Reverse(f.severity), f.camera.is_some()));
     for p in &mut plans {

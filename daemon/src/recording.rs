@@ -129,8 +129,11 @@ impl Begun {
         session.started_utc_ns = utc.utc_ns;
         session.host = rustix::system::uname().nodename().to_string_lossy().into_owned();
         session.rig_config.clone_from(&config.text);
+        session.calibration.clone_from(&config.calibration_text);
         session.max_spread_ns =
             max_spread_ns(streams.iter().map(|s| reach_ns(s, streams.iter().chain(&others), sets_hz)));
+        let firmware = streams.iter().filter(|s| !s.firmware.is_empty());
+        session.firmware = firmware.map(|s| (s.stream.id.camera.to_string(), s.firmware.clone())).collect();
         session.computed = streams.iter().filter_map(|s| s.computed.clone()).collect();
         session.streams = streams.iter().map(facts::record_of).collect();
         session.motion = units.iter().map(motion::record_of).collect();

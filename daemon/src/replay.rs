@@ -318,6 +318,7 @@ fn recording_config(sources: &mut Sources) -> RigConfig {
         supervisor: SupervisorConfig::default(),
         cdm: CdmConfig::default(),
         calibration: None,
+        calibration_text: sources.session().calibration.clone(),
         cameras: Vec::new(),
         text: sources.session().rig_config.clone(),
         path: None,

@@ -427,10 +427,15 @@ impl Inner {
                 if stream.profile.format.is_motion() && !info.motion.is_empty() {
                     calibration = format!("{calibration}; {}", info.motion);
                 }
+                let correction = camera.config.refined_correction();
+                if let Some(correction) = correction.filter(|_| is_refined(&stream.id)) {
+                    calibration = format!("{calibration}; {correction}");
+                }
                 StreamFacts {
                     stream: Arc::clone(stream),
                     model: info.model.clone(),
                     serial: info.serial.clone(),
+                    firmware: info.firmware.clone(),
                     calibration,
                     camera_pose: state.pose,
                     computed: camera.computed(&stream.id),
@@ -439,6 +444,11 @@ impl Inner {
         }
         facts
     }
+}
+
+/// Whether the refine stage makes the stream.
+fn is_refined(id: &StreamId) -> bool {
+    [depthrig_cdm::stage::REFINED, depthrig_cdm::stage::ALIGNED].contains(&id.stream.as_str())
 }
 
 impl Control for Inner {

@@ -5,7 +5,7 @@ use crate::wake::Wake;
 use depthrig_bus::{
     DropReason, FrameHeader, FrameMut, HostTime, MOTION_SAMPLE_BYTES, PixelFormat, Publisher,
 };
-use depthrig_driver::clock::ClockQuality;
+use depthrig_driver::clock::{CalibratedLatency, ClockQuality};
 use depthrig_driver::{FrameMeta, FrameSink, Loan};
 use std::sync::{Arc, MutexGuard};
 
@@ -23,6 +23,7 @@ struct Port {
     template: FrameHeader,
     session: u64,
     loan: Option<FrameMut>,
+    latency: Option<CalibratedLatency>,
 }
 
 impl BusSink {
@@ -31,9 +32,17 @@ impl BusSink {
     pub fn new(streams: Vec<(Arc<Stream>, Arc<Publisher>, FrameHeader)>, wake: Arc<Wake>) -> Self {
         let port = |(stream, publisher, template): (Arc<Stream>, Arc<Publisher>, FrameHeader)| {
             let session = stream.books().begin_session();
-            Port { stream, publisher, template, session, loan: None }
+            Port { stream, publisher, template, session, loan: None, latency: None }
         };
         Self { streams: streams.into_iter().map(port).collect(), wake }
+    }
+
+    /// The same with the latencies that a calibration found, one for each stream.
+    pub fn with_latencies(mut self, latencies: &[Option<CalibratedLatency>]) -> Self {
+        for (port, latency) in self.streams.iter_mut().zip(latencies) {
+            port.latency = *latency;
+        }
+        self
     }
 }
 
@@ -71,6 +80,7 @@ impl Port {
             flags: meta.flags.0,
             gain: meta.gain,
             temperature_c: meta.temperature_c,
+            latency_ns: meta.latency_ns,
             payload_len,
             ..template
         };
@@ -167,5 +177,9 @@ impl FrameSink for BusSink {
         if let Some(mut books) = self.streams.get(stream).and_then(Port::books) {
             books.clock = Some(*quality);
         }
+    }
+
+    fn calibrated_latency(&self, stream: usize) -> Option<CalibratedLatency> {
+        self.streams.get(stream)?.latency
     }
 }

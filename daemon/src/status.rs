@@ -165,6 +165,36 @@ pub struct CameraStatus {
     /// How its depth is refined; `None` when that is not asked for.
     #[serde(default)]
     pub refine: Option<RefineStatus>,
+    /// The calibration of the mount that it has; `None` without one.
+    #[serde(default)]
+    pub mount: Option<CalibrationStatus>,
+}
+
+/// How old a camera's calibration on the mount is, and what it is worth.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct CalibrationStatus {
+    /// When it was made.
+    pub created: String,
+    /// Days since then; `None` for a date that cannot be read.
+    pub age_days: Option<f64>,
+    /// Its accuracy in words, on one line.
+    pub worth: String,
+    /// Standard deviation of the camera's place, millimetres; 0 for the reference.
+    pub sigma_mm: f64,
+    /// Standard deviation of its direction, degrees; 0 for the reference.
+    pub sigma_deg: f64,
+    /// Root mean square of the residuals, pixels.
+    pub rms_px: f64,
+    /// Residual of views that the intrinsics were not fitted to, pixels.
+    pub held_out_px: Option<f64>,
+    /// Standard deviation of the projection where it is largest, pixels.
+    pub projection_worst_px: f64,
+    /// Difference of projection between the calibrations of two halves of the views, pixels.
+    pub halves_differ_px: Option<f64>,
+    /// Their difference in place, millimetres.
+    pub halves_differ_mm: Option<f64>,
+    /// Why it may not hold, with the cure.
+    pub warnings: Vec<String>,
 }
 
 /// Where the refining of a camera's depth stands.

@@ -54,6 +54,8 @@ pub struct Books {
     pub epoch_base: u32,
     /// Epoch of the newest frame.
     pub epoch: u32,
+    /// Temperature of the device at the newest frame that states one, °C.
+    pub temperature_c: Option<f32>,
     /// Stated uncertainty of the newest capture time.
     pub uncertainty_ns: u64,
     /// Frames flagged as uncertain in time.
@@ -172,6 +174,9 @@ impl Books {
         self.delivered += 1;
         self.epoch = header.clock_epoch;
         self.uncertainty_ns = header.capture_uncertainty_ns;
+        if header.temperature_c.is_finite() {
+            self.temperature_c = Some(header.temperature_c);
+        }
         self.uncertain += u64::from(header.has(FrameFlags::TIME_UNCERTAIN));
         self.note_metadata(header.metadata_level(), FrameFlags(header.flags));
         let is_motion = header.pixel_format().is_some_and(PixelFormat::is_motion);

@@ -11,7 +11,7 @@ mod strangers;
 
 use depthrig_bus::clock::HostTime;
 use depthrig_bus::{RigName, RuntimeDir};
-use depthrig_daemon::api::{self, MAX_BODY_BYTES, OPENAPI, ROUTES, ServerHandle};
+use depthrig_daemon::api::{self, MAX_BODY_BYTES, MAX_FOLLOWERS, OPENAPI, ROUTES, ServerHandle};
 use depthrig_daemon::client::Client;
 use depthrig_daemon::control::{RecordRequest, SeekRequest};
 use depthrig_daemon::status::CameraState;
@@ -199,10 +199,101 @@ fn every_answer_of_a_live_server_fits_the_document() {
     check("GET", "/v1/replay", &served.get("/v1/replay"), 200);
     served.fake.fail_next(ErrorKind::NotFound, "as scripted");
     check("POST", "/v1/replay/seek", &served.post("/v1/replay/seek", r#"{"id": 9}"#), 404);
+    let events = "/v1/calibration/events";
+    check("POST", events, &served.post(events, &capture_event(3).to_string()), 204);
+    check("POST", events, &served.post(events, "{}"), 400);
+    let following: Vec<_> = (0..MAX_FOLLOWERS).map(|_| served.follow()).collect();
+    check("GET", events, &served.get(events), 503);
+    drop(following);
     check("POST", "/v1/stop", &served.post("/v1/stop", ""), 202);
     assert!(served.fake.stop_was_asked());
     let all: BTreeSet<_> = ROUTES.iter().map(|r| (r.method.to_owned(), r.path.to_owned())).collect();
     assert_eq!(seen, all, "a route was not tried");
+}
+
+/// An event as a capture makes it, after so many views.
+fn capture_event(views: u64) -> Value {
+    let hint = json!({"text": "to the left of front's image, at 0.5 m", "camera": "front", "seen_by": ["front"],
+        "outline": [[0.1, 0.2], [0.3, 0.2], [0.3, 0.4], [0.1, 0.4]], "distance_m": 0.5, "tilt": "top_away", "gain": 0.1});
+    let camera = json!({"name": "front", "corners": 54, "at": [[0.1, 0.2]], "views": views, "coverage": [0, 3],
+        "coverage_columns": 2, "worst_px": 0.4, "missing": ["1 of 10 views"]});
+    let progress = json!({"state": "hold_still", "views": views, "cameras": [camera],
+        "pairs": [{"a": "front", "b": "side", "shared": 2, "missing": 1}], "missing": [], "hint": hint});
+    json!({"utc_ns": 1, "out": "views", "is_finished": false, "refused": [], "progress": progress})
+}
+
+/// The lines that a follower reads.
+struct Following(std::io::BufReader<UnixStream>);
+
+impl Following {
+    /// The next line that is not empty.
+    fn line(&mut self) -> String {
+        loop {
+            let mut line = String::new();
+            let read = std::io::BufRead::read_line(&mut self.0, &mut line).unwrap();
+            assert!(read > 0, "the answer ended");
+            // Chunks of the answer begin with their length.
+            if line.starts_with("data: ") || line.starts_with("HTTP/") {
+                return line.trim_end().to_owned();
+            }
+        }
+    }
+
+    fn event(&mut self) -> Value {
+        serde_json::from_str(self.line().strip_prefix("data: ").unwrap()).unwrap()
+    }
+}
+
+impl Served {
+    fn follow(&self) -> Following {
+        let mut stream = self.unix();
+        stream.set_read_timeout(Some(Duration::from_secs(20))).unwrap();
+        stream.write_all(b"GET /v1/calibration/events HTTP/1.1\r\nhost: localhost\r\n\r\n").unwrap();
+        let mut following = Following(std::io::BufReader::new(stream));
+        assert_eq!(following.line(), "HTTP/1.1 200 OK");
+        following
+    }
+}
+
+#[test]
+fn events_of_a_calibration_reach_those_who_follow() {
+    let served = served();
+    let document = Document::new(serde_json::from_str(OPENAPI).unwrap());
+    let mut early = served.follow();
+    let post = |views| served.post("/v1/calibration/events", &capture_event(views).to_string()).status;
+    assert_eq!(post(1), 204);
+    assert_eq!(early.event(), capture_event(1));
+    document.check_value("CaptureEvent", &capture_event(1));
+    let mut late = served.follow();
+    assert_eq!(late.event(), capture_event(1), "one who comes late gets the last one");
+    assert_eq!(post(2), 204);
+    assert_eq!(early.event(), capture_event(2));
+    assert_eq!(late.event(), capture_event(2));
+    // One who does not read holds up nobody, and gets the latest.
+    for views in 3..200 {
+        assert_eq!(post(views), 204);
+    }
+    let mut last = early.event();
+    while last["progress"]["views"] != json!(199) {
+        last = early.event();
+    }
+    // A field that is not known is refused with its name, and changes nothing.
+    let mut wrong = capture_event(7);
+    wrong["progress"]["cameras"][0]["corners"] = json!("many");
+    let refused = served.post("/v1/calibration/events", &wrong.to_string());
+    assert_eq!(refused.status, 400);
+    assert!(refused.body.contains("many"), "{}", refused.body);
+    assert_eq!(served.follow().event(), capture_event(199));
+    // Places come back, and the end of the service ends the answer.
+    for _ in 0..3 * MAX_FOLLOWERS {
+        drop(served.follow());
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    let mut last = served.follow();
+    last.event();
+    served.server.stop();
+    let mut rest = String::new();
+    std::io::Read::read_to_string(&mut last.0, &mut rest).unwrap();
 }
 
 #[test]

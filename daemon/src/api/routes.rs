@@ -1,5 +1,6 @@
 //! The calls of the API: one table that the router is built from and the OpenAPI document is compared with.
 
+use super::events::{CaptureEvent, Events};
 use super::reply::Refusal;
 use super::{SERVER_HEADER, allowed, guard, limits};
 use crate::control::{Control, RecordRequest, ReplayControl, SeekRequest};
@@ -12,7 +13,7 @@ use axum::http::{HeaderValue, Method, StatusCode, Uri, header};
 use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{MethodRouter, get, post};
-use axum::{Json, Router};
+use axum::{Extension, Json, Router};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
@@ -33,8 +34,11 @@ pub struct Route {
     handler: fn() -> MethodRouter<Rig>,
 }
 
+/// Events of a calibration, posted and followed.
+const CALIBRATION_EVENTS: &str = "/v1/calibration/events";
+
 /// Every call of the API.
-pub const ROUTES: [Route; 17] = [
+pub const ROUTES: [Route; 19] = [
     Route { method: "GET", path: "/v1/status", handler: || get(status) },
     Route { method: "GET", path: "/v1/health", handler: || get(health) },
     Route { method: "GET", path: "/v1/config", handler: || get(config) },
@@ -49,6 +53,8 @@ pub const ROUTES: [Route; 17] = [
     Route { method: "POST", path: "/v1/replay/step", handler: || post(replay_step) },
     Route { method: "POST", path: "/v1/replay/rate", handler: || post(replay_rate) },
     Route { method: "POST", path: "/v1/replay/loop", handler: || post(replay_loop) },
+    Route { method: "GET", path: CALIBRATION_EVENTS, handler: || get(calibration_follow) },
+    Route { method: "POST", path: CALIBRATION_EVENTS, handler: || post(calibration_post) },
     Route { method: "POST", path: "/v1/stop", handler: || post(stop) },
     Route { method: "GET", path: "/v1/openapi.json", handler: || get(openapi) },
     Route { method: "GET", path: "/metrics", handler: || get(scrape) },
@@ -126,12 +132,13 @@ impl Health {
     }
 }
 
-pub(super) fn router(control: Rig) -> Router {
+pub(super) fn router(control: Rig, events: Events) -> Router {
     let router = ROUTES.iter().fold(Router::new(), |router, r| router.route(r.path, (r.handler)()));
     router
         .fallback(unknown_path)
         .method_not_allowed_fallback(wrong_method)
         .with_state(control)
+        .layer(Extension(events))
         .layer(middleware::from_fn(limits::whole_body))
         .layer(middleware::from_fn(guard::json_posts))
         .layer(middleware::from_fn(name_server))
@@ -233,6 +240,16 @@ async fn of_replay(
     call(rig, on_replay).await.map(Json)
 }
 
+async fn calibration_post(Extension(events): Extension<Events>, body: Bytes) -> Answer<StatusCode> {
+    let event: CaptureEvent = parse(&body)?;
+    events.post(&event)?;
+    Ok(StatusCode::NO_CONTENT)
+}
+
+async fn calibration_follow(Extension(events): Extension<Events>) -> Answer<Response> {
+    events.follow()
+}
+
 async fn stop(State(rig): State<Rig>) -> Answer<StatusCode> {
     call(rig, |rig| {
         rig.request_stop();
@@ -258,7 +275,8 @@ async fn unknown_path(uri: Uri) -> Refusal {
 }
 
 async fn wrong_method(method: Method, uri: Uri) -> Refusal {
-    let wanted = ROUTES.iter().find(|r| r.path == uri.path()).map_or("another method", |r| r.method);
+    let wanted: Vec<&str> = ROUTES.iter().filter(|r| r.path == uri.path()).map(|r| r.method).collect();
+    let wanted = wanted.join(" and ");
     let message = format!("{} answers to {wanted}, not to {method}", uri.path());
     Refusal::new(StatusCode::METHOD_NOT_ALLOWED, message)
 }

@@ -1,5 +1,6 @@
 //! The thread that serves: it accepts, keeps connections few and short-lived, and ends within half a second.
 
+use super::events::Events;
 use super::limits::{HEAD_TIMEOUT, Limited, WRITE_TIMEOUT};
 use super::socket::{self, SocketFile};
 use super::token::{self, Token};
@@ -104,7 +105,7 @@ async fn run(
     port: Option<Port>,
     stopped: watch::Receiver<bool>,
 ) {
-    let router = routes::router(control);
+    let router = routes::router(control, Events::new(stopped.clone()));
     // Connections of the port are anybody's on this computer: they must not take the places of the socket.
     let port_places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
     let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));

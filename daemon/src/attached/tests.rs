@@ -111,6 +111,7 @@ pub(crate) fn rig_with(port: &str) -> RigStatus {
         warnings: Vec::new(),
         reconnects: 0,
         refine: None,
+        mount: None,
         streams: Vec::new(),
     };
     RigStatus {

@@ -40,7 +40,8 @@ pub(super) fn open_session(
     let wanted = requests(camera, device.profiles());
     let stream = device.start(&wanted).map_err(in_camera)?;
     let mut profiles = stream.profiles().to_vec();
-    let pose = calibration::apply(&camera.config, &mut profiles, &mut info).map_err(in_camera)?;
+    let calibrated = calibration::apply(&camera.config, &mut profiles, &mut info).map_err(in_camera)?;
+    let pose = calibrated.pose;
     camera.state().pose = pose;
     let streams = adopt(camera, shared, &profiles, &info).map_err(in_camera)?;
     let mut ports = Vec::new();
@@ -63,9 +64,14 @@ pub(super) fn open_session(
         ports.push((s, publisher, header));
     }
     open_refinement(camera, shared, &info).map_err(|e| {
-        in_camera(depthrig_driver::Error::new(DriverErrorKind::Io, e.to_string()).with_source(e))
+        let kind = match e.kind() {
+            crate::ErrorKind::BadInput => DriverErrorKind::BadInput,
+            _ => DriverErrorKind::Io,
+        };
+        in_camera(depthrig_driver::Error::new(kind, e.to_string()).with_source(e))
     })?;
-    Ok(Session { info, stream, sink: Box::new(BusSink::new(ports, Arc::clone(&shared.frames))) })
+    let sink = BusSink::new(ports, Arc::clone(&shared.frames)).with_latencies(&calibrated.latencies);
+    Ok(Session { info, stream, sink: Box::new(sink) })
 }
 
 /// The streams to request of the device: those that the rig lists. Without a list it is every stream, at later openings
@@ -100,6 +106,7 @@ fn open_refinement(camera: &Camera, shared: &Shared, info: &DeviceInfo) -> Resul
     }
     let readers =
         Readers { color: shared.bus.subscriber(&color.id)?, depth: shared.bus.subscriber(&depth.id)? };
+    let correct = calibration::correct_of(&camera.config, config, &depth.profile, info)?;
     let color_ns = color.profile.period_ns() as i64;
     let refinement = Arc::new(Refinement::new(Setup {
         camera: camera.config.name.clone(),
@@ -107,6 +114,7 @@ fn open_refinement(camera: &Camera, shared: &Shared, info: &DeviceInfo) -> Resul
         config: config.clone(),
         refined: Arc::clone(refined),
         aligned: aligned.first().cloned(),
+        correct,
         color_ns,
         frame_ns: depth.profile.period_ns() as i64,
         tolerance_ns: color_ns / 2 + 1_000_000,

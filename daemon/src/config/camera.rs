@@ -55,7 +55,17 @@ pub(super) fn read(
     let name = name?.value;
     let backend = backend?;
     let streams = if streams.is_empty() { backend.default_streams() } else { streams };
-    Some(CameraConfig { name, pose, streams, record, stereo, refine, backend, calibration: Vec::new() })
+    Some(CameraConfig {
+        name,
+        pose,
+        streams,
+        record,
+        stereo,
+        refine,
+        backend,
+        calibration: Vec::new(),
+        depth: Vec::new(),
+    })
 }
 
 fn streams(camera: &Section<'_, '_>) -> Vec<WantedStream> {

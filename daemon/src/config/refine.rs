@@ -53,6 +53,7 @@ pub(super) fn read(
         record: s.or("record", d.record, |_| Ok(())),
         align: s.or("align", d.align, |_| Ok(())),
         is_aligned: s.or("is_aligned", d.is_aligned, |_| Ok(())),
+        corrected: s.or("corrected", d.corrected, |_| Ok(())),
         depth: s.or("depth", depth.to_owned(), |name: &String| {
             let starts = name == "depth" || name.starts_with("depth_");
             if starts {

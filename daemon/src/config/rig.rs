@@ -73,6 +73,7 @@ pub(super) fn read(
         supervisor,
         cdm,
         calibration,
+        calibration_text: String::new(),
         cameras,
         text,
         path,

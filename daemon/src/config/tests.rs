@@ -777,7 +777,7 @@ const REFINED: &str = "rig = \"r\"\n[cdm]\nthreads = 3\nlibrary = \"lib/ort\"\nm
     [[camera]]\nname = \"a\"\nbackend = \"synthetic\"\nrecord = [\"depth\", \"depth_aligned\"]\n\
     [camera.refine]\nengine = \"onnxruntime\"\nmodel = \"my/net.pth\"\nrate_hz = 0\ninput_size = 252\n\
     precision = \"bf16\"\ndevice = \"tensorrt:1\"\nformat = \"depth_f32\"\nfill_reach = 0.5\nrecord = true\nalign = true\n\
-    is_aligned = true\n\
+    is_aligned = true\ncorrected = true\n\
     [[camera]]\nname = \"b\"\nbackend = \"synthetic\"\nrefine = { model = \"cdm-d435\" }\n\
     [[camera]]\nname = \"c\"\nbackend = \"synthetic\"\n";
 
@@ -799,6 +799,7 @@ fn how_depth_is_refined_is_read_with_all_its_keys() {
         record: true,
         align: true,
         is_aligned: true,
+        corrected: true,
         depth: "depth".into(),
     };
     assert_eq!(rig.cameras[0].refine.as_ref(), Some(&written_out));

@@ -75,6 +75,7 @@ fn rig() -> RigStatus {
         warnings: Vec::new(),
         reconnects: 1,
         refine: (name == "d435").then(refine),
+        mount: None,
         streams,
     };
     RigStatus {

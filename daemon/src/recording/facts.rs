@@ -13,6 +13,8 @@ pub struct StreamFacts {
     pub model: String,
     /// Serial number of its camera.
     pub serial: String,
+    /// Firmware of its camera; empty if unknown.
+    pub firmware: String,
     /// Where its calibration comes from.
     pub calibration: String,
     /// Pose of its camera on the mount.

@@ -59,6 +59,7 @@ mod tests {
             stream: Arc::new(Stream::new(id, profile, true, 4)),
             model: String::new(),
             serial: String::new(),
+            firmware: String::new(),
             calibration: String::new(),
             camera_pose: Pose::IDENTITY,
             computed: None,

@@ -130,6 +130,7 @@ impl Inner {
                 reconnects: 0,
                 streams: vec![status],
                 refine: None,
+                mount: None,
             });
         }
         for refinement in lock(&self.refinements).iter() {
@@ -155,6 +156,7 @@ impl Inner {
                 stream: Arc::clone(stream),
                 model: record.model.clone(),
                 serial: record.serial.clone(),
+                firmware: String::new(),
                 calibration: record.calibration.clone(),
                 camera_pose: Pose::IDENTITY,
                 computed: self.computed.iter().find(|c| c.stream == record.id).cloned(),
@@ -164,6 +166,7 @@ impl Inner {
                 stream: Arc::clone(stream),
                 model: record.model.clone(),
                 serial: record.serial.clone(),
+                firmware: String::new(),
                 calibration: record.calibration.clone(),
                 camera_pose: Pose::IDENTITY,
                 computed: None,

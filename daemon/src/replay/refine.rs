@@ -43,6 +43,7 @@ pub fn refinements(inner: &Inner, bus: &Bus, engine: EngineChoice) -> Result<Vec
             config: config.clone(),
             refined: stream,
             aligned: None,
+            correct: None,
             color_ns,
             frame_ns: depth_ns,
             tolerance_ns,

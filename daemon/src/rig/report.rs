@@ -70,6 +70,13 @@ fn camera(inner: &Inner, camera: &Camera, now: HostTime) -> CameraStatus {
     let state = camera.state();
     let info = state.info.clone().unwrap_or_default();
     let accounts = inner.set_accounts();
+    let temperature_c = state.streams.iter().find_map(|s| s.books().temperature_c).map(f64::from);
+    let mount = crate::camera::calibration_status(
+        &camera.config,
+        &info,
+        temperature_c,
+        UtcPair::sample().utc_ns(now),
+    );
     CameraStatus {
         name: camera.config.name.to_string(),
         backend: camera.config.backend.name().to_owned(),
@@ -83,10 +90,12 @@ fn camera(inner: &Inner, camera: &Camera, now: HostTime) -> CameraStatus {
         message: state.message.clone(),
         warnings: {
             let notice = lock(&camera.notice);
-            notice.iter().cloned().chain(silent_units(inner, &state, now)).collect()
+            let doubts = mount.iter().flat_map(|m| m.warnings.iter().map(|w| format!("calibration: {w}")));
+            notice.iter().cloned().chain(silent_units(inner, &state, now)).chain(doubts).collect()
         },
         reconnects: state.reconnects,
         refine: state.refinement.as_ref().map(|refinement| refinement.status()),
+        mount,
         streams: state
             .all_streams()
             .map(|s| {

@@ -4,7 +4,7 @@ use crate::status::{RefineState, RefineStatus};
 use crate::stream::Stream;
 use depthrig_bus::sync::lock;
 use depthrig_bus::{CameraName, DropReason, Frame, HostTime, StageStep, Subscriber};
-use depthrig_cdm::stage::RefineConfig;
+use depthrig_cdm::stage::{Correct, RefineConfig};
 use std::sync::{Arc, Mutex, MutexGuard};
 
 /// Frames over which the steps are measured.
@@ -23,6 +23,8 @@ pub struct Refinement {
     pub refined: Arc<Stream>,
     /// Depth in the view of colour, when that is published.
     pub aligned: Option<Arc<Stream>>,
+    /// How depth is corrected first.
+    pub correct: Option<Correct>,
     /// Colour and depth of one moment are at most this far apart, nanoseconds.
     pub tolerance_ns: i64,
     /// How depth frames follow each other, nanoseconds.
@@ -66,6 +68,8 @@ pub struct Setup {
     pub refined: Arc<Stream>,
     /// Depth in the view of colour, when that is published.
     pub aligned: Option<Arc<Stream>>,
+    /// How depth is corrected first; `None`: not at all.
+    pub correct: Option<Correct>,
     /// Time between colour frames, nanoseconds.
     pub color_ns: i64,
     /// Time between depth frames, nanoseconds.
@@ -169,6 +173,7 @@ impl Refinement {
             config,
             refined,
             aligned,
+            correct,
             color_ns,
             frame_ns,
             tolerance_ns,
@@ -193,7 +198,19 @@ impl Refinement {
         let work = Work { readers: Some(readers), ..Work::default() };
         let work = Mutex::new(work);
         let facts = Mutex::new(facts);
-        Self { camera, config, device_model, refined, aligned, tolerance_ns, frame_ns, color_ns, work, facts }
+        Self {
+            camera,
+            config,
+            device_model,
+            refined,
+            aligned,
+            correct,
+            tolerance_ns,
+            frame_ns,
+            color_ns,
+            work,
+            facts,
+        }
     }
 
     /// Its streams.

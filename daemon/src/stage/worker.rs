@@ -142,7 +142,7 @@ impl Worker {
             refinement.runs(&description.engine, &description.model, self.note.as_deref());
             let session = refinement.refined.books().begin_session();
             let aligned_session = refinement.aligned.as_ref().map_or(0, |s| s.books().begin_session());
-            let view = View::default();
+            let view = View::corrected_by(refinement.correct.clone());
             self.cameras.push(WorkerCamera {
                 refinement: Arc::clone(refinement),
                 view,

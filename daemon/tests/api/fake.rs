@@ -129,6 +129,7 @@ impl Fake {
             warnings: vec!["rows are 1.5 px apart".to_owned()],
             reconnects: 2,
             refine: (name == "d435").then(refine),
+            mount: None,
             streams: vec![
                 stream(&format!("{name}/depth"), Some(3.25)),
                 stream(&format!("{name}/color"), None),

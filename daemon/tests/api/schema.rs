@@ -75,6 +75,13 @@ impl Document {
         }
     }
 
+    /// `value` fits the schema of this name.
+    pub fn check_value(&self, schema: &str, value: &Value) {
+        if let Err(why) = self.fits(&self.0["components"]["schemas"][schema], value) {
+            panic!("{schema}: {why}\n{value}");
+        }
+    }
+
     fn fits(&self, schema: &Value, value: &Value) -> Result<(), String> {
         for (keyword, wanted) in schema.as_object().ok_or("a schema that is not an object")? {
             match keyword.as_str() {
