@@ -1,21 +1,30 @@
-//! The parts of `depthrig calibrate`: views of a board from images and datasets, and the HTML report.
+//! The parts of `depthrig calibrate`: views of a board from images and datasets, depth of a wall, and the HTML report.
 
+pub mod arm;
+pub mod baseline;
+pub mod capture;
+pub mod corrected;
 pub mod dataset;
 pub mod images;
 pub mod input;
+pub mod known;
 pub mod page;
+pub mod robot;
+pub mod timed;
+pub mod wall;
 
 use anyhow::{Context as _, Result, bail};
 use depthrig_bus::Intrinsics;
 use depthrig_bus::files;
 use depthrig_calib::Error;
 use depthrig_calibrate::adjustment::Corner;
-use depthrig_calibrate::board::Board;
+use depthrig_calibrate::board::{Board, Pattern};
 use depthrig_calibrate::detect::{Detection, Detector, GrayImage};
-use depthrig_calibrate::file::{Calibration, Provenance};
+use depthrig_calibrate::file::{CalibratedCamera, Calibration, Conditions, Provenance};
 use depthrig_calibrate::intrinsics::ImageSize;
 use depthrig_calibrate::rig::{RigView, Seen};
 use image::RgbImage;
+use std::collections::BTreeMap;
 use std::path::Path;
 
 /// A description of a board is no longer than this, bytes.
@@ -45,6 +54,8 @@ pub struct Sightings {
     pub images: usize,
     /// Images without a board, and why a board was refused.
     pub refused: Vec<String>,
+    /// State that cameras reported, by name, where anything is known.
+    pub conditions: BTreeMap<String, Conditions>,
 }
 
 /// Reads a text file.
@@ -90,6 +101,29 @@ pub fn seen(
     })
 }
 
+/// Images of a camera without a board that are looked at in a mirror, before it is said that none shows one.
+pub const MIRROR_TRIES: usize = 5;
+
+/// Whether an image shows the board mirrored. A chessboard looks the same in a mirror.
+///
+/// # Errors
+/// As [`seen`].
+pub fn is_mirrored(detector: &dyn Detector, board: &Board, size: ImageSize, grey: &[u8]) -> Result<bool> {
+    if board.pattern == Pattern::Chessboard {
+        return Ok(false);
+    }
+    let mut mirrored = grey.to_vec();
+    mirrored.chunks_exact_mut(size.width as usize).for_each(<[u8]>::reverse);
+    Ok(seen(detector, board, 0, size, &mirrored)?.seen.is_some())
+}
+
+/// The error for a camera whose images are mirrored.
+pub fn mirrored(camera: &str) -> anyhow::Error {
+    anyhow::anyhow!(
+        "camera {camera}: its images are mirrored: the board is in them only when they are flipped; turn mirroring off in the camera or in the          program that took them, or flip them"
+    )
+}
+
 /// Result of [`seen`].
 pub struct Looked {
     /// The board.
@@ -101,13 +135,34 @@ pub struct Looked {
 /// A calibration is no longer than this, bytes.
 const CALIBRATION_MAX_BYTES: u64 = 4 << 20;
 
+/// Reads a calibration's text.
+///
+/// # Errors
+/// When it cannot be read or is not text; the message names the file.
+pub fn calibration_text(path: &Path) -> Result<String> {
+    text(path, CALIBRATION_MAX_BYTES, "; `depthrig calibrate solve` writes one")
+}
+
 /// Reads a calibration.
 ///
 /// # Errors
 /// When it cannot be read or is wrong; the message names the file.
 pub fn calibration(path: &Path) -> Result<Calibration> {
-    let text = text(path, CALIBRATION_MAX_BYTES, "; `depthrig calibrate solve` writes one")?;
+    let text = calibration_text(path)?;
     Calibration::from_toml(&text).map_err(|e: Error| anyhow::anyhow!("{}: {e}", path.display()))
+}
+
+/// Reads a camera of a calibration.
+///
+/// # Errors
+/// As [`calibration`], and when it has no such camera.
+pub fn camera(path: &Path, name: &str) -> Result<CalibratedCamera> {
+    let calibration = calibration(path)?;
+    let found = calibration.of_camera(name).next().cloned();
+    found.with_context(|| {
+        let all: Vec<&str> = calibration.cameras.iter().map(|c| c.name.as_str()).collect();
+        format!("{}: has no camera {name}; it has {}", path.display(), all.join(", "))
+    })
 }
 
 /// Refuses views of nothing.

@@ -1,32 +1,32 @@
-//! A picture of a point cloud, seen from beside the mount: where two cameras put one surface at two places, the picture shows it twice.
+//! A drawing of a point cloud, seen from beside the mount: where two cameras put one surface at two places, the drawing shows it twice.
 
 use core::cmp::Ordering;
 use depthrig_calib::PointCloud;
 use glam::{Mat3, Vec3};
 use image::{Rgb, RgbImage};
 
-/// Size of the picture, pixels.
+/// Size of the drawing, pixels.
 const WIDTH: u32 = 1280;
 const HEIGHT: u32 = 800;
 /// Field of view over the height, radians.
 const VIEW: f32 = 0.7;
-/// How far the eye is turned away from the mount's own view, to the right and up, radians.
+/// How far the viewpoint is turned away from the mount's own view, to the right and up, radians.
 const YAW: f32 = 0.45;
 const PITCH: f32 = 0.35;
-/// Share of the points that the picture has to show; the rest are far away.
+/// Share of the points that the drawing has to show; the rest are far away.
 const SHOWN: f64 = 0.5;
 /// Side of a point, pixels.
 const POINT: i32 = 2;
 const PAPER: Rgb<u8> = Rgb([250, 250, 250]);
 
-/// Draws the points in their colours, nearer ones in front. The picture is empty if there are none.
+/// Draws the points in their colours, nearer ones in front. Without points the drawing is empty.
 pub fn draw(cloud: &PointCloud) -> RgbImage {
     let mut image = RgbImage::from_pixel(WIDTH, HEIGHT, PAPER);
     let points: Vec<Vec3> = cloud.points.iter().map(|p| Vec3::from(*p)).collect();
-    let Some(eye) = Eye::new(&points) else { return image };
+    let Some(viewpoint) = Viewpoint::new(&points) else { return image };
     let mut nearest = vec![f32::INFINITY; (WIDTH * HEIGHT) as usize];
     for (point, color) in points.iter().zip(&cloud.colors) {
-        let Some(seen) = eye.project(*point) else { continue };
+        let Some(seen) = viewpoint.project(*point) else { continue };
         for y in seen.y..seen.y + POINT {
             for x in seen.x..seen.x + POINT {
                 let (Ok(x), Ok(y)) = (u32::try_from(x), u32::try_from(y)) else { continue };
@@ -44,10 +44,10 @@ pub fn draw(cloud: &PointCloud) -> RgbImage {
     image
 }
 
-/// From where the picture is seen.
-struct Eye {
+/// From where the cloud is seen.
+struct Viewpoint {
     center: Vec3,
-    /// From the mount's axes to the picture's.
+    /// From the mount's axes to the drawing's.
     turn: Mat3,
     distance: f32,
 }
@@ -59,7 +59,7 @@ struct Seen {
     z: f32,
 }
 
-impl Eye {
+impl Viewpoint {
     fn new(points: &[Vec3]) -> Option<Self> {
         let center = Vec3::new(
             quantile(points.iter().map(|p| p.x), 0.5)?,
@@ -103,11 +103,12 @@ mod tests {
         let blue = [0, 0, 200];
         let around = [[-0.5, 0.0, 1.0], [0.5, 0.0, 1.0], [0.0, -0.5, 1.0], [0.0, 0.5, 1.0]];
         let mut points = around.to_vec();
-        // Twice on the line from the eye through the middle, the farther one last.
+        // Twice on the line from the viewpoint through the middle, the farther one last.
         let away = Mat3::from_rotation_y(-YAW) * Mat3::from_rotation_x(-PITCH) * Vec3::Z;
         points.extend([[0.0, 0.0, 1.0], (Vec3::Z + 0.2 * away).into()]);
         let image = drawn(&points, &[blue, blue, blue, blue, red, blue]);
-        let center = Eye::new(&points.iter().map(|p| Vec3::from(*p)).collect::<Vec<_>>()).unwrap().center;
+        let center =
+            Viewpoint::new(&points.iter().map(|p| Vec3::from(*p)).collect::<Vec<_>>()).unwrap().center;
         assert!(center.distance(Vec3::Z) < 0.2, "{center}");
         let reds: Vec<(u32, u32)> =
             image.enumerate_pixels().filter(|(_, _, p)| p.0 == red).map(|(x, y, _)| (x, y)).collect();
@@ -116,7 +117,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_an_empty_picture() {
+    fn nothing_is_an_empty_drawing() {
         assert!(drawn(&[], &[]).pixels().all(|p| *p == PAPER));
     }
 }

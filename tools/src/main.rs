@@ -16,6 +16,7 @@ mod exit;
 mod font;
 mod image_file;
 mod install;
+mod live;
 mod logging;
 mod out;
 mod outfile;

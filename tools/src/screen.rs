@@ -1,4 +1,4 @@
-//! The terminal as `top` uses it: a page that is redrawn in place, and keys without Enter.
+//! The terminal as `top` and `calibrate capture` use it: a page that is redrawn in place, and keys without Enter.
 
 use anyhow::{Context, Result};
 use core::time::Duration;

@@ -74,12 +74,33 @@ pub fn status(rig: &RigStatus, style: Style) -> String {
     lines.extend(streams(rig, style));
     lines.extend(poor_metadata(rig));
     lines.extend(rig.cameras.iter().filter_map(|c| refined(c, style)));
+    lines.extend(calibrated(rig, style));
     let troubles: Vec<_> = rig.cameras.iter().filter_map(|c| trouble(c, style)).collect();
     if !troubles.is_empty() {
         lines.push(String::new());
         lines.extend(troubles);
     }
     lines.join("\n")
+}
+
+/// Says how old the cameras' calibrations are and what they are worth, or that several cameras have none.
+fn calibrated(rig: &RigStatus, style: Style) -> Vec<String> {
+    if rig.replay.is_some() {
+        return Vec::new();
+    }
+    if rig.cameras.len() > 1 && rig.cameras.iter().all(|c| c.mount.is_none()) {
+        return vec!["mount   not calibrated: poses are those of the rig file".to_owned()];
+    }
+    let lines = |c: &CameraStatus| {
+        let Some(mount) = &c.mount else { return Vec::new() };
+        let age = match mount.age_days {
+            Some(d) if d >= 1.0 => format!("{d:.0} days old"),
+            Some(_) => "of today".to_owned(),
+            None => format!("of {}", mount.created),
+        };
+        out::item("", &format!("{}: calibration {age}: {}", c.name, mount.worth), style.width)
+    };
+    rig.cameras.iter().flat_map(lines).collect()
 }
 
 /// Describes the state of a replay on one line.

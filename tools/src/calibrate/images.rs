@@ -1,11 +1,11 @@
 //! Sightings of a board from folders of images.
 
-use super::{Looked, Sightings, ViewedCamera, grey, seen};
+use super::{Looked, MIRROR_TRIES, Sightings, ViewedCamera, grey, is_mirrored, mirrored, seen};
 use crate::exit::UsageError;
 use crate::image_file;
 use anyhow::{Context as _, Result, bail};
 use depthrig_calibrate::board::Board;
-use depthrig_calibrate::detect::detector;
+use depthrig_calibrate::detect::{Detector, detector};
 use depthrig_calibrate::file::Provenance;
 use depthrig_calibrate::intrinsics::ImageSize;
 use depthrig_calibrate::rig::RigView;
@@ -86,11 +86,19 @@ pub fn read(
             match (seen, refused) {
                 (Some(seen), _) => view.seen.push(seen),
                 (None, Some(why)) => views.refused.push(format!("{}: {why}", path.display())),
-                (None, None) => views.refused.push(format!("{}: no board", path.display())),
+                (None, None) => views.refused.push(format!(
+                    "{}: no board as it is described; it may be hidden, blurred or another one",
+                    path.display()
+                )),
             }
         }
         if !view.seen.is_empty() {
             views.views.push(view);
+        }
+    }
+    for (camera, of_camera) in files.iter().enumerate() {
+        if !views.views.iter().any(|v| v.seen.iter().any(|s| s.camera == camera)) {
+            refuse_mirrored(detector.as_ref(), board, &folders[camera].name, of_camera)?;
         }
     }
     for (folder, size) in folders.iter().zip(sizes) {
@@ -105,7 +113,23 @@ pub fn read(
     Ok(Some(views))
 }
 
-fn list(folder: &Path) -> Result<Vec<PathBuf>> {
+/// Refuses images that show the board in a mirror alone.
+fn refuse_mirrored(detector: &dyn Detector, board: &Board, camera: &str, files: &[PathBuf]) -> Result<()> {
+    for path in files.iter().take(MIRROR_TRIES) {
+        let image = image_file::open(path)?.to_rgb8();
+        let size = ImageSize { width: image.width(), height: image.height() };
+        if is_mirrored(detector, board, size, &grey(&image))? {
+            return Err(mirrored(camera));
+        }
+    }
+    Ok(())
+}
+
+/// The images in a folder, in the order of their names.
+///
+/// # Errors
+/// When it cannot be read or has no images.
+pub fn list(folder: &Path) -> Result<Vec<PathBuf>> {
     let entries =
         folder.read_dir().with_context(|| format!("{}: cannot be read as a folder", folder.display()))?;
     let mut files = Vec::new();
@@ -124,7 +148,7 @@ fn list(folder: &Path) -> Result<Vec<PathBuf>> {
 }
 
 /// The last number in a file's name, which cameras that were triggered together share.
-fn number(path: &Path) -> Option<u64> {
+pub fn number(path: &Path) -> Option<u64> {
     let name = path.file_stem()?.to_str()?;
     let end = name.rfind(|c: char| c.is_ascii_digit())? + 1;
     // A character before the number may have several bytes.

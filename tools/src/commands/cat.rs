@@ -1,5 +1,6 @@
 //! `depthrig cat`: lists frames of a dataset or writes them as image files.
 
+use crate::calibrate::corrected::Corrected;
 use crate::context::Context;
 use crate::exit::{Exit, UsageError};
 use crate::out;
@@ -70,6 +71,8 @@ pub struct CatArgs {
     /// New folder for the image files
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
+    #[command(flatten)]
+    corrected: Corrected,
     /// Print JSON; without --out one object per frame and line
     #[arg(long)]
     json: bool,
@@ -88,7 +91,10 @@ enum Form {
 
 /// Lists or writes frames.
 pub fn run(args: &CatArgs, context: &Context) -> Result<Exit> {
-    let dataset = Dataset::open(&args.dataset)?;
+    if args.corrected.is_asked() && args.out.is_none() {
+        return Err(UsageError("--corrected is for images; write them with --out DIR".into()).into());
+    }
+    let dataset = args.corrected.of(Dataset::open(&args.dataset)?)?;
     let sets = match (args.set, args.at) {
         (Some(id), _) => SetChoice::Id(id),
         (_, Some(moment)) => SetChoice::Nearest(moment),

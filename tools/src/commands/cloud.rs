@@ -1,7 +1,9 @@
 //! `depthrig cloud`: the point cloud of all cameras at one moment, and how well their surfaces agree.
 
 use crate::calibrate;
-use crate::exit::Exit;
+use crate::context::Context;
+use crate::exit::{Exit, UsageError};
+use crate::live::{self, Shot};
 use crate::outfile::{OutFile, Overwrite};
 use crate::{cloud_image, image_file, out};
 use anyhow::{Context as _, Result, bail};
@@ -11,28 +13,36 @@ use depthrig_calib::{
 };
 use depthrig_calibrate::file::Calibration;
 use depthrig_calibrate::mount::Source;
-use depthrig_recorder::{Dataset, DatasetFrame, DatasetSet, Edge, PixelMode, SetSpan};
+use depthrig_recorder::Dataset;
 use serde::Serialize;
 use std::path::PathBuf;
 
+mod moment;
+
+use moment::Moment;
+
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-Depth of each camera as it was recorded, in the mount's coordinates, coloured. The table has for each pair of cameras the median difference of depth on
-surfaces that both see: a good calibration shows the depth's own errors there, a bad one more. --calibration puts another calibration's poses
-and intrinsics in place of the recorded ones; --by-camera gives each camera a colour of its own, which shows seams.
+Depth of each camera as it was recorded, or as the running rig delivers it now, in the mount's coordinates, coloured. The table has for each pair
+of cameras the median difference of depth on surfaces that both see: a good calibration shows the depth's own errors there, a bad one more. --calibration puts
+another calibration's poses and intrinsics in place of the recorded ones; --corrected applies its corrections of depth to a dataset; --by-camera gives each
+camera a colour of its own, which shows seams.
 
 Exit codes: 0 written, 1 failure, 2 wrong usage.
 
 Examples:
+  depthrig cloud mount --by-camera
   depthrig cloud data/20261125_1015_kitchen --out kitchen.ply
+  depthrig cloud data/20261125_1015_kitchen --calibration calibration.toml --corrected --out corrected.ply
   depthrig cloud data/20261125_1015_kitchen --set 40 --depth depth_refined --calibration calibration.toml --out after.ply";
 
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct CloudArgs {
-    /// Dataset folder, or one segment file
-    dataset: PathBuf,
-    /// Set to show [default: the middle one]
+    /// Dataset, segment file or running rig [default: the only rig running]
+    #[arg(value_name = "RIG|DATASET")]
+    source: Option<PathBuf>,
+    /// Set of a dataset to show [default: the middle one]
     #[arg(long, value_name = "ID")]
     set: Option<u64>,
     /// Depth stream to show [default: depth_refined, else depth, else the first mode]
@@ -41,6 +51,9 @@ pub struct CloudArgs {
     /// Calibration whose poses and intrinsics replace the recorded ones
     #[arg(long, value_name = "FILE")]
     calibration: Option<PathBuf>,
+    /// Correct depth as the calibration says
+    #[arg(long, requires = "calibration")]
+    corrected: bool,
     /// Leave out points further away than this, metres
     #[arg(long, value_name = "M", default_value_t = 5.0, value_parser = crate::args::range_limit_m)]
     max_m: f64,
@@ -50,7 +63,7 @@ pub struct CloudArgs {
     /// Point cloud to write (PLY)
     #[arg(long, value_name = "FILE", default_value = "cloud.ply")]
     out: PathBuf,
-    /// Picture of the cloud to write (PNG), seen from beside the mount
+    /// Image of the cloud to write (PNG), seen from beside the mount
     #[arg(long, value_name = "FILE")]
     image: Option<PathBuf>,
     #[command(flatten)]
@@ -74,28 +87,41 @@ const COLORS: [[u8; 3]; 7] = [
 const GREY: [u8; 3] = [160, 160, 160];
 
 /// Reads, joins, compares and writes.
-pub fn run(args: &CloudArgs) -> Result<Exit> {
-    let dataset = Dataset::open(&args.dataset)?;
+pub fn run(args: &CloudArgs, context: &Context) -> Result<Exit> {
+    let source = live::source(args.source.as_deref(), context)?;
     let calibration = args.calibration.as_deref().map(calibrate::calibration).transpose()?;
     let file = OutFile::new(&args.out, args.overwrite, &[])?;
     let image = args.image.as_ref().map(|path| OutFile::new(path, args.overwrite, &[])).transpose()?;
-    let set = set(&dataset, args.set)?;
-    let mut views = Vec::new();
-    let mut cameras: Vec<String> = Vec::new();
-    for record in &dataset.session().streams {
-        let name = record.id.camera.to_string();
-        if !cameras.contains(&name) {
-            cameras.push(name);
+    let moment = match &source {
+        live::Source::Dataset(path) => {
+            let mut dataset = Dataset::open(path)?;
+            if let (true, Some(calibration), Some(file)) = (args.corrected, &calibration, &args.calibration) {
+                dataset = calibrate::corrected::corrected(dataset, calibration, file)?;
+            }
+            Moment::recorded(&dataset, args.set)?
         }
-    }
-    for name in &cameras {
-        views.extend(View::new(&dataset, &set, name, args, calibration.as_ref(), views.len())?);
+        live::Source::Rig(_) if args.corrected => {
+            return Err(UsageError("--corrected corrects a dataset; record one first".into()).into());
+        }
+        live::Source::Rig(_) if args.set.is_some() => {
+            return Err(UsageError(
+                "--set chooses a set of a dataset; a running rig has one, the next".into(),
+            )
+            .into());
+        }
+        live::Source::Rig(rig) => match Moment::live(rig, context)? {
+            Some(moment) => moment,
+            None => bail!("interrupted; nothing was written"),
+        },
+    };
+    let mut views = Vec::new();
+    for name in &moment.cameras {
+        views.extend(View::new(&moment, name, args, calibration.as_ref(), views.len())?);
     }
     if views.is_empty() {
         bail!(
-            "set {} of {}: has no depth{}",
-            set.id,
-            args.dataset.display(),
+            "{}: has no depth{}",
+            moment.name,
             args.depth.as_ref().map_or_else(String::new, |d| format!(" '{d}'"))
         );
     }
@@ -111,7 +137,7 @@ pub fn run(args: &CloudArgs) -> Result<Exit> {
         image.write(&image_file::png(&cloud_image::draw(&all))?)?;
     }
     let report = Report {
-        set: set.id,
+        set: moment.set,
         points: all.points.len(),
         pairs: pairs(&views)?,
         cameras: views.iter().map(View::line).collect(),
@@ -124,17 +150,6 @@ pub fn run(args: &CloudArgs) -> Result<Exit> {
         out::line(format_args!("written   {}{image}", file.path().display()))?;
     }
     Ok(Exit::Good)
-}
-
-fn set(dataset: &Dataset, id: Option<u64>) -> Result<DatasetSet> {
-    let mut reader = dataset.set_reader()?;
-    let number = match id {
-        Some(id) => {
-            SetSpan { from: Some(Edge::Set(id)), to: Some(Edge::Set(id)) }.numbers(&mut reader)?.start
-        }
-        None => reader.times().len() / 2,
-    };
-    Ok(reader.read(number, PixelMode::Stored)?)
 }
 
 /// A camera's depth in the mount's coordinates.
@@ -151,33 +166,30 @@ struct View {
 impl View {
     /// `None` for a camera without the depth asked for.
     fn new(
-        dataset: &Dataset,
-        set: &DatasetSet,
+        moment: &Moment,
         name: &str,
         args: &CloudArgs,
         calibration: Option<&Calibration>,
         index: usize,
     ) -> Result<Option<Self>> {
-        let streams = &dataset.session().streams;
-        let of_camera: Vec<&DatasetFrame> = set
-            .frames
-            .iter()
-            .filter(|f| streams.get(f.stream).is_some_and(|s| s.id.camera.as_str() == name))
-            .collect();
+        let of_camera: Vec<&Shot> = moment.shots.iter().filter(|f| f.header.camera() == name).collect();
         let named = |stream: &str| of_camera.iter().find(|f| f.header.stream() == stream).copied();
-        let is_depth = |f: &&&DatasetFrame| f.header.pixel_format().is_some_and(PixelFormat::is_depth);
+        let is_depth = |f: &&&Shot| f.header.pixel_format().is_some_and(PixelFormat::is_depth);
         let frame = match &args.depth {
             Some(stream) => named(stream),
+            // Refined depth has no correction of its own.
             None => named("depth_refined")
+                .filter(|_| !args.corrected)
                 .or_else(|| named("depth"))
                 .or_else(|| of_camera.iter().find(is_depth).copied()),
         };
         let Some(frame) = frame else { return Ok(None) };
         let geometry = Geometry::new(&of_camera, name, calibration)?;
         let header = &frame.header;
-        let pixels = frame.decoded()?;
         let what = || format!("{name}/{}", header.stream());
-        let Some(depth_m) = image_file::depth_m(header, &pixels)? else { bail!("{}: is not depth", what()) };
+        let Some(depth_m) = image_file::depth_m(header, &frame.pixels)? else {
+            bail!("{}: is not depth", what())
+        };
         let intrinsics = geometry.intrinsics(header);
         let pose = geometry.pose(header);
         let size = (header.width, header.height);
@@ -230,14 +242,16 @@ struct Calibrated<'a> {
 }
 
 impl<'a> Geometry<'a> {
-    fn new(frames: &[&DatasetFrame], name: &str, calibration: Option<&'a Calibration>) -> Result<Self> {
-        let Some(calibration) = calibration else { return Ok(Self { calibrated: None }) };
+    fn new(frames: &[&Shot], name: &str, calibration: Option<&'a Calibration>) -> Result<Self> {
+        let Some(calibration) = calibration.filter(|c| !c.cameras.is_empty()) else {
+            return Ok(Self { calibrated: None });
+        };
         for entry in calibration.of_camera(name) {
             let Some(frame) = frames.iter().find(|f| f.header.stream() == entry.stream) else { continue };
             let header = &frame.header;
             if (header.width, header.height) != (entry.width, entry.height) {
                 bail!(
-                    "{name}/{}: was calibrated at {}x{}, the dataset has {}x{}",
+                    "{name}/{}: was calibrated at {}x{}, the image has {}x{}",
                     entry.stream,
                     entry.width,
                     entry.height,
@@ -248,7 +262,7 @@ impl<'a> Geometry<'a> {
             let correction = entry.pose().compose(&header.pose.inverse());
             return Ok(Self { calibrated: Some(Calibrated { entry, correction }) });
         }
-        bail!("the calibration has no stream of camera {name} that the dataset has, too")
+        bail!("the calibration has no stream of camera {name} that there is, too")
     }
 
     fn pose(&self, header: &FrameHeader) -> Pose {
@@ -267,12 +281,12 @@ impl<'a> Geometry<'a> {
 
 /// The colour of each pixel of depth; `None` where it cannot be found, as without intrinsics.
 fn colors(
-    color: &DatasetFrame,
+    color: &Shot,
     depth: &FrameHeader,
     depth_m: &[f32],
     geometry: &Geometry<'_>,
 ) -> Result<Option<Vec<u8>>> {
-    let rgb = image_file::to_rgb(&color.header, &color.decoded()?)?;
+    let rgb = image_file::to_rgb(&color.header, &color.pixels)?;
     let of = |h: &FrameHeader| (geometry.intrinsics(h), (h.width, h.height), geometry.pose(h));
     let (color_k, color_size, color_pose) = of(&color.header);
     let (depth_k, depth_size, depth_pose) = of(depth);
@@ -312,7 +326,8 @@ fn pairs(views: &[View]) -> Result<Vec<PairLine>> {
 
 #[derive(Serialize)]
 struct Report {
-    set: u64,
+    /// Number of the set; absent of a running rig.
+    set: Option<u64>,
     points: usize,
     cameras: Vec<CameraLine>,
     pairs: Vec<PairLine>,
@@ -353,9 +368,9 @@ impl Report {
         } else {
             out::table(&header, 2, rows)
         };
+        let set = self.set.map_or_else(|| "now".to_owned(), |id| format!("set {id}"));
         format!(
-            "{pairs}\nset {}: {} of {}",
-            self.set,
+            "{pairs}\n{set}: {} of {}",
             out::count(self.points, "point"),
             out::count(self.cameras.len(), "camera")
         )

@@ -1,5 +1,6 @@
 //! `depthrig export`: exports datasets to other layouts.
 
+use crate::calibrate::corrected::Corrected;
 use crate::context::Context;
 use crate::exit::{Exit, UsageError};
 use crate::out;
@@ -53,6 +54,8 @@ pub struct Common {
     /// Parts of 100 sets to process in parallel [default: one per core]
     #[arg(short = 'j', long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
     jobs: Option<u16>,
+    #[command(flatten)]
+    corrected: Corrected,
     /// Print the report as JSON
     #[arg(long)]
     json: bool,
@@ -75,7 +78,8 @@ pub fn run(command: &ExportCommand, context: &Context) -> Result<Exit> {
 /// Runs an exporter with a progress bar and prints its report.
 fn drive(exporter: &mut dyn Exporter, common: &Common, context: &Context) -> Result<Exit> {
     let dir = &common.out;
-    let datasets = common.datasets.iter().map(|d| Dataset::open(d)).collect::<Result<Vec<_>, _>>()?;
+    let open = |path: &PathBuf| common.corrected.of(Dataset::open(path)?);
+    let datasets = common.datasets.iter().map(open).collect::<Result<Vec<_>>>()?;
     let mut options = ExportOptions::default();
     if let Some(jobs) = common.jobs {
         options.workers = usize::from(jobs);

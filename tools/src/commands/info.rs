@@ -136,6 +136,14 @@ fn text(info: &DatasetInfo, lost: &[String]) -> String {
         ));
     }
     let mut add = |what: &str, text: &str| lines.push(format!("{what}: {}", printable::line(text)));
+    if let Some(c) = &info.calibration {
+        let attached = c.attached_utc_ns.map_or_else(
+            || "of the rig that recorded it".to_owned(),
+            |t| format!("attached {}, before: {}", utc_text(t), c.before.as_deref().unwrap_or("none")),
+        );
+        add("calibration", &format!("made {}, {attached}", c.created));
+    }
+    info.history.iter().for_each(|e| add("edited", &format!("{} {}", utc_text(e.utc_ns), e.text())));
     info.computed.iter().for_each(|producer| add("computed", &producer.to_string()));
     for what in lost {
         add("lost", what);

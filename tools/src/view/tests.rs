@@ -45,6 +45,7 @@ fn camera(name: &str, state: CameraState, message: Option<&str>, lost: u64) -> C
         warnings: Vec::new(),
         reconnects: 0,
         refine: None,
+        mount: None,
         streams: vec![stream(&format!("{name}/depth"), lost)],
     }
 }

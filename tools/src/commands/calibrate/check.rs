@@ -1,25 +1,29 @@
 //! `depthrig calibrate check`: whether a mount is still as it was calibrated.
 
-use crate::calibrate;
+use crate::calibrate::capture::live_views::{Wanted, live_views};
 use crate::calibrate::input::Input;
+use crate::calibrate::{self, known};
 use crate::context::Context;
 use crate::exit::Exit;
 use crate::out;
-use anyhow::{Result, bail};
+use anyhow::{Context as _, Result};
+use core::time::Duration;
+use depthrig_bus::StreamId;
 use depthrig_calibrate::check::{Checked, KnownCamera, Motion, check};
-use depthrig_calibrate::file::Calibration;
 use depthrig_calibrate::rig::RigView;
 use serde::Serialize;
 use std::path::PathBuf;
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-Hold the board still where several cameras see it, at a few places; ten seconds of a recording are enough. A camera has moved if its motion is
+Hold the board still where several cameras see it, at a few places: for ten seconds before the running rig, or in a recording. A camera has moved if its motion is
 significant (one false alarm in 2,000 checks of a camera) and above 0.5 mm or 0.05 degrees.
 
 Exit codes: 0 nothing moved, 1 failure, 2 wrong usage, 3 a camera has moved.
 
 Examples:
+  depthrig calibrate check                                     the only rig that is running
+  depthrig calibrate check mount --seconds 20
   depthrig calibrate check data/20261126_0900
   depthrig calibrate check --images left=left --images right=right --calibration stereo.toml";
 
@@ -31,6 +35,9 @@ pub struct CheckArgs {
     /// Calibration to compare with
     #[arg(long, value_name = "FILE", default_value = "calibration.toml")]
     calibration: PathBuf,
+    /// How long to look at a running rig, seconds
+    #[arg(long, value_name = "S", default_value_t = 10.0, value_parser = crate::args::positive_seconds)]
+    seconds: f64,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -39,9 +46,25 @@ pub struct CheckArgs {
 /// Reads, compares and prints.
 pub fn run(args: &CheckArgs, context: &Context) -> Result<Exit> {
     let file = calibrate::calibration(&args.calibration)?;
-    let mut views = args.input.read(&file.board, context)?;
-    let known = known(&file);
-    let places = places(&views, &file, args)?;
+    let mut views = match args.input.rig(context)? {
+        Some(rig) => {
+            let calibrated: Result<Vec<StreamId>, _> =
+                file.cameras.iter().map(|c| format!("{}/{}", c.name, c.stream).parse()).collect();
+            let calibrated = calibrated.with_context(|| args.calibration.display().to_string())?;
+            let named = args.input.streams();
+            let wanted = Wanted {
+                rig: &rig,
+                streams: if named.is_empty() { &calibrated } else { named },
+                board: &file.board,
+                length: Duration::from_secs_f64(args.seconds),
+            };
+            live_views(&wanted, context)?
+        }
+        None => args.input.read(&file.board, context)?,
+    };
+    let known = known::cameras(&file);
+    let places = known::places(&views.cameras, &file, &args.calibration)?;
+    known::compare_conditions(&views, &file, &args.calibration)?;
     // The calibration's order, whose first camera is the reference.
     for seen in views.views.iter_mut().flat_map(|v| &mut v.seen) {
         seen.camera = places[seen.camera];
@@ -54,52 +77,6 @@ pub fn run(args: &CheckArgs, context: &Context) -> Result<Exit> {
         out::line(report.text())?;
     }
     Ok(if found.moved.is_empty() { Exit::Good } else { Exit::Lost })
-}
-
-fn known(file: &Calibration) -> Vec<KnownCamera> {
-    file.cameras
-        .iter()
-        .map(|camera| KnownCamera {
-            name: camera.name.clone(),
-            intrinsics: camera.intrinsics(),
-            rig_from_camera: (&camera.pose()).into(),
-            covariance: camera.pose_covariance(),
-        })
-        .collect()
-}
-
-/// Index in the calibration of each camera that was looked at.
-fn places(views: &calibrate::Sightings, file: &Calibration, args: &CheckArgs) -> Result<Vec<usize>> {
-    let path = args.calibration.display();
-    views
-        .cameras
-        .iter()
-        .map(|camera| {
-            let Some(place) = file.cameras.iter().position(|c| c.name == camera.name) else {
-                bail!("{path}: has no camera {}", camera.name);
-            };
-            let entry = &file.cameras[place];
-            if entry.size() != camera.size {
-                bail!(
-                    "{path}: camera {} was calibrated at {}x{}, these images are {}x{}",
-                    entry.name,
-                    entry.width,
-                    entry.height,
-                    camera.size.width,
-                    camera.size.height
-                );
-            }
-            let serial = &camera.provenance.serial;
-            if !entry.serial.is_empty() && !serial.is_empty() && entry.serial != *serial {
-                bail!(
-                    "{path}: camera {} was calibrated with serial number {}, now it has {serial}; calibrate again",
-                    entry.name,
-                    entry.serial
-                );
-            }
-            Ok(place)
-        })
-        .collect()
 }
 
 /// The printed result.

@@ -9,13 +9,12 @@ use crate::progress::Progress;
 use crate::signals::Stop;
 use anyhow::{Context as _, Result, bail};
 use depthrig_bus::Pose;
-use depthrig_calibrate::file::CalibratedCamera;
 use depthrig_calibrate::hand_eye::{Arrangement, HandEye, HandEyeView, Noise, hand_eye};
 use depthrig_calibrate::{Distance, Rigid};
 use glam::{DQuat, DVec3};
 use serde::Serialize;
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
@@ -70,7 +69,7 @@ pub fn run(args: &HandEyeArgs, context: &Context) -> Result<Exit> {
     let board = calibrate::board(&args.board)?;
     let poses = poses(&calibrate::text(&args.poses, POSES_MAX_BYTES, "")?)
         .with_context(|| format!("{}: invalid poses", args.poses.display()))?;
-    let camera = camera(&args.calibration, &args.images.name)?;
+    let camera = calibrate::camera(&args.calibration, &args.images.name)?;
     let stop = Stop::on_signals()?;
     let mut bar = Progress::new(context.global.quiet > 0);
     let views = images::read(std::slice::from_ref(&args.images), &board, |done, total| {
@@ -117,15 +116,6 @@ pub fn run(args: &HandEyeArgs, context: &Context) -> Result<Exit> {
         out::line(result.text(&noise))?;
     }
     Ok(if left_out.is_empty() { Exit::Good } else { Exit::Lost })
-}
-
-fn camera(path: &Path, name: &str) -> Result<CalibratedCamera> {
-    let calibration = calibrate::calibration(path)?;
-    let found = calibration.of_camera(name).next().cloned();
-    found.with_context(|| {
-        let all: Vec<&str> = calibration.cameras.iter().map(|c| c.name.as_str()).collect();
-        format!("{}: has no camera {name}; it has {}", path.display(), all.join(", "))
-    })
 }
 
 /// Poses by the name of their view.

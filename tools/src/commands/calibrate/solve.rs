@@ -104,13 +104,22 @@ pub fn run(args: &SolveArgs, context: &Context) -> Result<Exit> {
     let result = calibrate_mount(&cameras, &found.views, options)?;
     let provenance: Vec<_> = views.cameras.iter().map(|c| c.provenance.clone()).collect();
     let created = OffsetDateTime::now_utc().replace_nanosecond(0)?.format(&Rfc3339)?;
-    let calibration = Calibration::new(&result, &board, &provenance, created, args.by.clone());
+    let mut calibration = Calibration::new(&result, &board, &provenance, created, args.by.clone());
+    for camera in &mut calibration.cameras {
+        camera.conditions = views.conditions.get(&camera.name).cloned().unwrap_or_default();
+    }
+    // A file that cannot be read any more has nothing to keep.
+    let before = args.out.exists().then(|| calibrate::calibration(&args.out).ok()).flatten();
+    let kept = before.map_or_else(Vec::new, |before| calibration.keep_from(&before));
     report.write(page::page(&calibration, &result, &refused, views.images).as_bytes())?;
     file.write(calibration.to_toml()?.as_bytes())?;
     if args.json {
         out::json(&Json::new(&calibration, &result, &refused))?;
     } else {
         out::line(summary(&result, &board, &refused))?;
+        if !kept.is_empty() {
+            out::line(format_args!("kept      {}, from the file before", kept.join(", ")))?;
+        }
         out::line(format_args!("written   {}, {}", file.path().display(), report.path().display()))?;
     }
     let lost = !refused.is_empty() || result.cameras.iter().any(|c| c.views == 0);

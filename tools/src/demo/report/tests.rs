@@ -89,6 +89,7 @@ fn status() -> RigStatus {
         reconnects: 0,
         streams: vec![stream("d435/color", 5), stream("d435/depth", 5)],
         refine: None,
+        mount: None,
     };
     RigStatus {
         rig: "rig".to_owned(),

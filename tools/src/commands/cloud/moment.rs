@@ -1,0 +1,89 @@
+//! The images of which a cloud is made: a set of a dataset, or what a running rig delivers now.
+
+use crate::context::Context;
+use crate::live::{self, LiveStreams, Shot};
+use crate::signals::Stop;
+use anyhow::Result;
+use core::time::Duration;
+use depthrig_bus::{RigName, StreamId};
+use depthrig_recorder::{Dataset, DatasetSet, Edge, PixelMode, SetSpan};
+
+/// The images of all cameras at one moment.
+pub(super) struct Moment {
+    /// For messages.
+    pub(super) name: String,
+    /// Number of the set, of a dataset.
+    pub(super) set: Option<u64>,
+    /// The cameras, in their order.
+    pub(super) cameras: Vec<String>,
+    /// The images.
+    pub(super) shots: Vec<Shot>,
+}
+
+/// Rounds of a live rig that a stream which has delivered nothing yet is waited for.
+const PATIENCE: usize = 20;
+const ROUND: Duration = Duration::from_millis(150);
+
+impl Moment {
+    /// A set of a dataset; without a number the middle one.
+    pub(super) fn recorded(dataset: &Dataset, id: Option<u64>) -> Result<Self> {
+        let set = set(dataset, id)?;
+        let shots: Result<Vec<Shot>> = set
+            .frames
+            .iter()
+            .map(|frame| Ok(Shot { header: frame.header, pixels: frame.decoded()? }))
+            .collect();
+        let cameras = dataset.session().streams.iter().map(|s| s.id.camera.to_string());
+        Ok(Self {
+            name: format!("set {} of {}", set.id, dataset.path().display()),
+            set: Some(set.id),
+            cameras: in_order(cameras),
+            shots: shots?,
+        })
+    }
+
+    /// The newest frame of every stream; `None` when it was interrupted. A running rig has at most half a frame between its streams.
+    pub(super) fn live(rig: &RigName, context: &Context) -> Result<Option<Self>> {
+        let stop = Stop::on_signals()?;
+        let ids: Vec<StreamId> = live::streams(rig, context)?.into_iter().map(|f| f.id).collect();
+        let mut streams = LiveStreams::open(rig, &ids, context)?;
+        let mut newest: Vec<Option<Shot>> = vec![None; ids.len()];
+        for _ in 0..PATIENCE {
+            let Some(shots) = streams.round(ROUND, &stop)? else { return Ok(None) };
+            let is_complete = shots.iter().all(Option::is_some);
+            for (newest, shot) in newest.iter_mut().zip(shots) {
+                *newest = shot.or(newest.take());
+            }
+            if is_complete {
+                break;
+            }
+        }
+        Ok(Some(Self {
+            name: format!("rig {rig}"),
+            set: None,
+            cameras: in_order(ids.iter().map(|id| id.camera.to_string())),
+            shots: newest.into_iter().flatten().collect(),
+        }))
+    }
+}
+
+fn in_order(names: impl Iterator<Item = String>) -> Vec<String> {
+    let mut all: Vec<String> = Vec::new();
+    for name in names {
+        if !all.contains(&name) {
+            all.push(name);
+        }
+    }
+    all
+}
+
+fn set(dataset: &Dataset, id: Option<u64>) -> Result<DatasetSet> {
+    let mut reader = dataset.set_reader()?;
+    let number = match id {
+        Some(id) => {
+            SetSpan { from: Some(Edge::Set(id)), to: Some(Edge::Set(id)) }.numbers(&mut reader)?.start
+        }
+        None => reader.times().len() / 2,
+    };
+    Ok(reader.read(number, PixelMode::Stored)?)
+}
