@@ -18,6 +18,8 @@ PEERS_VENV := .venv-peers
 FEED := .venv-feed
 # The vendor's SDK of OAK cameras, 450 MB.
 OAK := .venv-oak
+# Robots' meshes and a ray tracer, for the alignment of cameras with a robot's arm.
+ROBOTS := .venv-robots
 REQUIREMENTS := python/requirements-test.txt $(READERS)/requirements.txt
 
 .PHONY: help demo demo-calibration environments test check-debian13 test-long vm fuzz lint bench bench-peers bench-feed clean setup-build setup-test setup-vm setup-peers setup-fuzz
@@ -32,7 +34,7 @@ demo: setup-build ## the mount of seven cameras with ten depth modes, without a 
 demo-calibration: setup-build ## seven simulated cameras and a printed board: views, calibration, the cloud before and after
 	tools/demo-calibration.sh $(ARGS)
 
-environments: $(VENV)/.stamp $(LEROBOT)/.stamp $(OAK)/.stamp $(READERS)/node_modules/.stamp ## the environments of Python and Node that tests need
+environments: $(VENV)/.stamp $(LEROBOT)/.stamp $(OAK)/.stamp $(ROBOTS)/.stamp $(READERS)/node_modules/.stamp ## the environments of Python and Node that tests need
 	tools/python.sh environments
 
 test: setup-test environments ## every test: Rust, Python, third-party readers, the virtual machine
@@ -83,7 +85,7 @@ bench-feed: setup-build $(FEED)/.stamp ## latency to a NumPy array in another pr
 
 clean: ## remove build outputs
 	cargo clean
-	rm -rf $(VENV) $(LEROBOT) $(PEERS_VENV) $(FEED) $(OAK) $(READERS)/node_modules
+	rm -rf $(VENV) $(LEROBOT) $(PEERS_VENV) $(FEED) $(OAK) $(ROBOTS) $(READERS)/node_modules
 
 setup-build:
 	@tools/setup.sh build
@@ -123,6 +125,11 @@ $(FEED)/.stamp: $(PEERS)/requirements-feed.txt python/pyproject.toml
 
 $(OAK)/.stamp: python/requirements-oak.txt
 	tools/environment.sh $(OAK) python3 --no-cache-dir --requirement $<
+	touch $@
+
+$(ROBOTS)/.stamp: tests/python/requirements-robots.txt tests/python/robots_only.py
+	tools/environment.sh $(ROBOTS) python3 --no-deps --no-cache-dir --requirement $<
+	$(ROBOTS)/bin/python tests/python/robots_only.py
 	touch $@
 
 $(READERS)/node_modules/.stamp: $(READERS)/package.json $(READERS)/package-lock.json

@@ -101,12 +101,14 @@ fn whole(h: &FrameHeader) -> String {
         stage_ns,
         refiner,
         refiner_model,
+        latency_ns,
         reserved,
     } = *h;
     let names = (rig, camera, stream, model, serial, refiner, refiner_model, reserved);
     let made = (source_color_sequence, source_color_capture_time_ns, stage_ns);
     let image = (flags, format, width, height, stride, payload_len, gain, temperature_c.to_bits());
-    let times = (capture_time_ns, capture_uncertainty_ns, arrival_time_ns, publish_time_ns, exposure_ns);
+    let times =
+        (capture_time_ns, capture_uncertainty_ns, arrival_time_ns, publish_time_ns, exposure_ns, latency_ns);
     let device = (sequence, device_sequence, set_id, device_time, device_tick_ns, captured, dropped);
     let geometry = (depth_unit_m, intrinsics, pose, clock_domain, clock_epoch, source_sequence);
     format!("{magic:?}{version}{size}{names:?}{image:?}{times:?}{device:?}{geometry:?}{made:?}")
