@@ -8,10 +8,10 @@ import subprocess
 import tomllib
 from pathlib import Path
 
-import align_seeds as seeds
 import numpy as np
 import pytest
 from PIL import Image
+from test_calibrate_mount import of_quaternion
 from test_daemon import binary, command, environment, runtime
 
 __all__ = ["binary", "runtime"]
@@ -22,6 +22,58 @@ BOXES = [((0.10, 0.12, 0.08), (0, 0, 0.08)), ((0.05, 0.06, 0.18), (0, 0, 0.18)),
 HEIGHTS = [0.16, 0.36, 0.30]
 AXES = [(0.0, 0.6, 0.8), (0.0, 1.0, 0.0), (0.8, 0.6, 0.0)]
 LENS = f"{FOCAL},{FOCAL},{(WIDTH - 1) / 2},{(HEIGHT - 1) / 2},{WIDTH},{HEIGHT}"
+
+
+def rotation(axis: np.ndarray, angle: float) -> np.ndarray:
+    """Rodrigues' formula."""
+    x, y, z = axis / np.linalg.norm(axis)
+    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * k @ k
+
+
+def rpy(r: np.ndarray) -> list[float]:
+    """Roll, pitch and yaw of a rotation about fixed axes, radians."""
+    return [math.atan2(r[2, 1], r[2, 2]), math.asin(-np.clip(r[2, 0], -1, 1)), math.atan2(r[1, 0], r[0, 0])]
+
+
+def direction(rng: np.random.Generator) -> np.ndarray:
+    """A direction, all equally likely."""
+    v = rng.normal(size=3)
+    return v / np.linalg.norm(v)
+
+
+def camera(rng: np.random.Generator) -> np.ndarray:
+    """A camera that looks at an arm from 1.1 to 1.5 m, optical axes."""
+    azimuth, elevation, away = rng.uniform(-math.pi, math.pi), rng.uniform(0.1, 0.7), rng.uniform(1.1, 1.5)
+    target = np.array([0.0, 0.0, 0.35]) + rng.uniform(-0.08, 0.08, 3)
+    forward = -np.array([math.cos(azimuth) * math.cos(elevation), math.sin(azimuth) * math.cos(elevation), math.sin(elevation)])
+    right = np.cross(forward, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.column_stack([right, np.cross(forward, right), forward]) @ rotation(np.array([0, 0, 1.0]), rng.uniform(-0.2, 0.2))
+    pose[:3, 3] = target - forward * away
+    return pose
+
+
+def moved(pose: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A pose off by as much as a start may be."""
+    start = pose.copy()
+    start[:3, :3] = rotation(direction(rng), math.radians(15)) @ pose[:3, :3]
+    start[:3, 3] += direction(rng) * 0.1
+    return start
+
+
+def start_argument(start: np.ndarray) -> str:
+    """`--start`."""
+    return " ".join(f"{v:.9f}" for v in [*start[:3, 3], *rpy(start[:3, :3])])
+
+
+def distance(found: dict, pose: np.ndarray) -> tuple[float, float]:
+    """Millimetres and degrees between a result and the truth."""
+    r = of_quaternion(found["camera"]["rotation_xyzw"])
+    mm = 1e3 * float(np.linalg.norm(np.array(found["camera"]["translation_m"]) - pose[:3, 3]))
+    cosine = (np.trace(r.T @ pose[:3, :3]) - 1) / 2
+    return mm, math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
 
 
 def stl(half: tuple[float, ...], middle: tuple[float, ...]) -> bytes:
@@ -72,7 +124,7 @@ def look(positions: np.ndarray, pose: np.ndarray) -> np.ndarray:
     for i, (half, middle) in enumerate(BOXES):
         if i:
             step = np.eye(4)
-            step[:3, :3] = seeds.rotation(np.array(AXES[i - 1]), positions[i - 1])
+            step[:3, :3] = rotation(np.array(AXES[i - 1]), positions[i - 1])
             step[2, 3] = HEIGHTS[i - 1]
             link = link @ step
         from_base = np.linalg.inv(link) @ pose
@@ -92,8 +144,8 @@ class Case:
         rng = np.random.default_rng(4)
         self.folder = folder
         self.urdf = write_robot(folder)
-        self.pose = seeds.camera(rng)
-        self.start = seeds.moved(self.pose, rng)
+        self.pose = camera(rng)
+        self.start = moved(self.pose, rng)
         for name in ("masks", "depth"):
             (folder / name).mkdir()
         rows = ["view,joint2,joint0,joint1"]
@@ -108,7 +160,7 @@ class Case:
 
     def arguments(self, *more: str) -> list[str]:
         fixed = ["calibrate", "align", "--urdf", str(self.urdf), "--joints", str(self.joints), "--masks", str(self.folder / "masks")]
-        packages = ["--meshes", f"boxes={self.folder}", "--start", seeds.start_argument(self.start)]
+        packages = ["--meshes", f"boxes={self.folder}", "--start", start_argument(self.start)]
         return [*fixed, *packages, *([] if "--intrinsics" in more else ["--intrinsics", LENS]), *more]
 
 
@@ -122,7 +174,7 @@ def test_a_camera_beside_boxes_is_found(binary: str, runtime: Path, case: Case) 
     overlay = case.folder / "overlay"
     arguments = case.arguments("-o", str(out), "--overlay", str(overlay), "--json")
     found = json.loads(command(binary, runtime, *arguments))
-    mm, deg = seeds.distance(found, case.pose)
+    mm, deg = distance(found, case.pose)
     assert mm < 3.0 and deg < 0.3, (mm, deg)
     assert mm < 3 * found["sigma_mm"] and deg < 3 * found["sigma_deg"]
     assert found["camera_in"] == "base" and len(found["views"]) == 6
@@ -143,7 +195,7 @@ def test_a_camera_beside_boxes_is_found(binary: str, runtime: Path, case: Case) 
 def test_depth_helps(binary: str, runtime: Path, case: Case) -> None:
     without = json.loads(command(binary, runtime, *case.arguments("--json")))
     found = json.loads(command(binary, runtime, *case.arguments("--json", "--depth", str(case.folder / "depth"))))
-    mm, deg = seeds.distance(found, case.pose)
+    mm, deg = distance(found, case.pose)
     assert mm < 2.0 and deg < 0.2, (mm, deg)
     assert found["depth_mm"] < 1.0 and "depth_mm" not in without
     # A view without depth is used by its mask, and named.
@@ -205,7 +257,7 @@ def change_order(case: Case) -> list[str]:
 
 def change_start(case: Case) -> list[str]:
     turned = case.start.copy()
-    turned[:3, :3] = turned[:3, :3] @ seeds.rotation(np.array([0, 1.0, 0]), math.pi)
+    turned[:3, :3] = turned[:3, :3] @ rotation(np.array([0, 1.0, 0]), math.pi)
     case.start = turned
     return []
 

@@ -93,7 +93,7 @@ def test_the_error_of_depth_is_found_and_corrected(binary: str, runtime: Path, t
     command(binary, runtime, "calibrate", "depth", str(dataset), *arguments, codes=(2,))
     command(binary, runtime, "calibrate", "depth", str(dataset), *arguments, "--overwrite", codes=(2,))
 
-    # A few seconds of it show too few distances.
+    # A few seconds of it show too few distances; they get the whole wall's correction below.
     short = tmp_path / "short"
     command(binary, runtime, "trim", str(dataset), str(short), "--from", "0", "--to", "5")
     command(
@@ -132,6 +132,14 @@ def test_the_error_of_depth_is_found_and_corrected(binary: str, runtime: Path, t
     assert np.array_equal(before == 0, after == 0)
     some = before > 0
     assert np.abs(after[some] - truth(before[some])).max() < 2e-3
+
+    # Without a calibration of its own a dataset cannot be corrected; with one it needs no other.
+    shot = ("cat", str(short), "--at", "3", "--stream", "wrong/depth", "--format", "npy", "--corrected", "--out")
+    command(binary, runtime, *shot, str(tmp_path / "refused"), codes=(2,))
+    command(binary, runtime, "edit", str(short), "--calibration", str(out))
+    command(binary, runtime, *shot, str(tmp_path / "own"))
+    (own,) = (tmp_path / "own").rglob("*.npy")
+    assert np.array_equal(np.load(own), np.load(mended))
 
     paper = tmp_path / "paper"
     exported = json.loads(

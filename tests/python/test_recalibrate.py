@@ -119,6 +119,24 @@ def poses(found: dict[str, list]) -> dict[str, np.ndarray]:
     return stated[0]
 
 
+def exports_speak_of_it(binary: str, runtime: Path, dataset: Path, tmp_path: Path) -> None:
+    """Both exports have the colour cameras' new intrinsics and poses, and no frame that differs from them."""
+    for kind, pose in (("bytecameradepth", "pose"), ("lerobot", "pose_on_mount")):
+        out = tmp_path / kind
+        # An epoch of a few sets may have lost one; that is not the matter here.
+        said = command(binary, runtime, "export", kind, str(dataset), str(out), "--json", codes=(0, 3))
+        assert not [loss for loss in json.loads(said)["losses"] if "calibration" in loss], said
+        (file,) = out.rglob("*calibration.json")
+        told = json.loads(file.read_text())
+        streams = told["streams"] if "streams" in told else told["episodes"][0]["streams"]
+        for name, place in PLACE.items():
+            all_ = [s for s in streams if f"{name}/color" in (s.get("stream"), s.get("id"))]
+            assert all_, (kind, streams)
+            for stream in all_:
+                assert (stream["intrinsics"]["fx"], stream["intrinsics"]["cy"]) == (611.5, 241.5)
+                np.testing.assert_allclose(stream[pose]["translation_m"], place, atol=1e-12)
+
+
 def test_a_dataset_speaks_of_the_new_calibration_everywhere(
     binary: str, runtime: Path, dataset: Path, tmp_path: Path
 ) -> None:
@@ -178,6 +196,7 @@ def test_a_dataset_speaks_of_the_new_calibration_everywhere(
         assert frame is not None
         assert (frame.header.intrinsics.fx, frame.header.intrinsics.cy) == (611.5, 241.5)
         np.testing.assert_allclose(frame.header.pose.translation_m, PLACE["b"], atol=1e-12)
+    exports_speak_of_it(binary, runtime, dataset, tmp_path)
     # The same again is no change, and touches no segment.
     sizes = {p.name: p.stat().st_mtime_ns for p in dataset.iterdir()}
     again = json.loads(command(binary, runtime, "edit", str(dataset), "--calibration", str(file), "--json"))

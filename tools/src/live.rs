@@ -162,11 +162,12 @@ impl LiveStream {
     }
 }
 
-/// The streams of a rig that are images, with what its daemon says of them. Cameras that are being opened are waited for.
+/// The streams of a rig that are images, with what its daemon says of them. Cameras that are being opened are waited for; `None` when the
+/// end is asked for meanwhile.
 ///
 /// # Errors
 /// When the daemon does not answer.
-pub fn streams(rig: &RigName, context: &Context) -> Result<Vec<StreamFacts>> {
+pub fn streams(rig: &RigName, stop: &Stop, context: &Context) -> Result<Option<Vec<StreamFacts>>> {
     let client = Client::connect(&context.runtime()?, Some(rig))?;
     let began = HostTime::now();
     let status = loop {
@@ -175,7 +176,9 @@ pub fn streams(rig: &RigName, context: &Context) -> Result<Vec<StreamFacts>> {
         if !is_opening || began.elapsed() > OPEN {
             break status;
         }
-        std::thread::sleep(OPEN / 200);
+        if stop.wait(OPEN / 200) {
+            return Ok(None);
+        }
     };
     let mut all = Vec::new();
     for camera in &status.cameras {
@@ -189,7 +192,7 @@ pub fn streams(rig: &RigName, context: &Context) -> Result<Vec<StreamFacts>> {
             });
         }
     }
-    Ok(all)
+    Ok(Some(all))
 }
 
 /// Facts about a stream, from the daemon.

@@ -2,7 +2,7 @@
 
 use crate::exit::UsageError;
 use crate::out;
-use anyhow::Result;
+use anyhow::{Context as _, Result};
 use depthrig_calibrate::depth::Correction;
 use depthrig_calibrate::file::Calibration;
 use depthrig_recorder::{Dataset, PixelFilter};
@@ -11,10 +11,10 @@ use std::path::{Path, PathBuf};
 /// Options of commands that give depth out.
 #[derive(Debug, Clone, clap::Args)]
 pub struct Corrected {
-    /// Correct depth as the calibration says; the dataset stays as it is
-    #[arg(long, requires = "calibration")]
+    /// Correct depth as the dataset's calibration says; the dataset stays as it is
+    #[arg(long)]
     corrected: bool,
-    /// Calibration with the corrections of `depthrig calibrate depth`
+    /// Another calibration for --corrected
     #[arg(long, value_name = "FILE", requires = "corrected")]
     calibration: Option<PathBuf>,
 }
@@ -28,13 +28,26 @@ impl Corrected {
     /// The dataset, read with corrected depth if that was asked for.
     ///
     /// # Errors
-    /// As [`corrected`], and when the calibration cannot be read.
+    /// As [`corrected`].
     pub fn of(&self, dataset: Dataset) -> Result<Dataset> {
-        match &self.calibration {
-            Some(path) if self.corrected => corrected(dataset, &super::calibration(path)?, path),
-            _ => Ok(dataset),
-        }
+        if self.corrected { corrected(dataset, self.calibration.as_deref()) } else { Ok(dataset) }
     }
+}
+
+/// A dataset's own calibration, and what to call it in messages.
+fn own(dataset: &Dataset) -> Result<(Calibration, String)> {
+    let text = &dataset.session().calibration;
+    let path = dataset.path().display();
+    if text.is_empty() {
+        return Err(UsageError(format!(
+            "{path}: has no calibration to correct depth by; name one with --calibration FILE, or attach it for good with `depthrig edit \
+             --calibration FILE`"
+        ))
+        .into());
+    }
+    let shown = format!("the calibration of {path}");
+    let calibration = Calibration::from_toml(text).with_context(|| shown.clone())?;
+    Ok((calibration, shown))
 }
 
 /// The correction of a stream.
@@ -44,12 +57,17 @@ struct Entry {
     correction: Correction,
 }
 
-/// The dataset as it is read with corrected depth. Depth streams without a correction are named on stderr and stay as they are.
+/// The dataset as it is read with depth corrected by the calibration in `file`, or by its own. Depth streams without a correction are
+/// named on stderr and stay as they are.
 ///
 /// # Errors
-/// A usage error when the calibration has none for any stream, or one of another device or size.
-pub fn corrected(dataset: Dataset, calibration: &Calibration, path: &Path) -> Result<Dataset> {
-    let shown = path.display();
+/// When the calibration cannot be read; a usage error when there is none, when it corrects no stream of the dataset, and when it is of
+/// another device or size.
+pub fn corrected(dataset: Dataset, file: Option<&Path>) -> Result<Dataset> {
+    let (calibration, shown) = match file {
+        Some(file) => (super::calibration(file)?, file.display().to_string()),
+        None => own(&dataset)?,
+    };
     let mut entries = Vec::new();
     let mut without = Vec::new();
     for record in dataset.session().streams.iter().filter(|r| r.format.is_depth()) {

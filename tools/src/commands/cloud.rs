@@ -25,7 +25,7 @@ use moment::Moment;
 pub const EXAMPLES: &str = "\
 Depth of each camera as it was recorded, or as the running rig delivers it now, in the mount's coordinates, coloured. The table has for each pair
 of cameras the median difference of depth on surfaces that both see: a good calibration shows the depth's own errors there, a bad one more. --calibration puts
-another calibration's poses and intrinsics in place of the recorded ones; --corrected applies its corrections of depth to a dataset; --by-camera gives each
+another calibration's poses and intrinsics in place of the recorded ones; --corrected applies its corrections of depth, or those of the dataset's own; --by-camera gives each
 camera a colour of its own, which shows seams.
 
 Exit codes: 0 written, 1 failure, 2 wrong usage.
@@ -51,8 +51,8 @@ pub struct CloudArgs {
     /// Calibration whose poses and intrinsics replace the recorded ones
     #[arg(long, value_name = "FILE")]
     calibration: Option<PathBuf>,
-    /// Correct depth as the calibration says
-    #[arg(long, requires = "calibration")]
+    /// Correct a dataset's depth as that calibration says, or else the dataset's own
+    #[arg(long)]
     corrected: bool,
     /// Leave out points further away than this, metres
     #[arg(long, value_name = "M", default_value_t = 5.0, value_parser = crate::args::range_limit_m)]
@@ -95,8 +95,8 @@ pub fn run(args: &CloudArgs, context: &Context) -> Result<Exit> {
     let moment = match &source {
         live::Source::Dataset(path) => {
             let mut dataset = Dataset::open(path)?;
-            if let (true, Some(calibration), Some(file)) = (args.corrected, &calibration, &args.calibration) {
-                dataset = calibrate::corrected::corrected(dataset, calibration, file)?;
+            if args.corrected {
+                dataset = calibrate::corrected::corrected(dataset, args.calibration.as_deref())?;
             }
             Moment::recorded(&dataset, args.set)?
         }

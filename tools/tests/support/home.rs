@@ -122,10 +122,16 @@ impl Home {
         self.write("rig.toml", &text)
     }
 
-    /// Waits until the rig answers.
+    /// Waits until the rig answers and each of its cameras streams; a daemon answers before they are open.
     #[track_caller]
     pub fn wait_for_rig(&self, rig: &str) {
-        wait(|| self.run(&["status", "--rig", rig]).code == 0, "the rig does not answer");
+        let streams = || {
+            let said = self.run(&["status", "--rig", rig, "--json"]);
+            let status: serde_json::Value = serde_json::from_str(&said.out).unwrap_or_default();
+            let cameras = status["cameras"].as_array().map_or(&[][..], Vec::as_slice);
+            !cameras.is_empty() && cameras.iter().all(|camera| camera["state"] == "streaming")
+        };
+        wait(streams, "the rig does not stream");
     }
 
     /// Waits until the recording in progress has so many sets.

@@ -33,13 +33,13 @@ pub struct Wanted<'a> {
 pub fn live_views(wanted: &Wanted<'_>, context: &Context) -> Result<Sightings> {
     let Wanted { rig, streams, board, length } = *wanted;
     let stop = Stop::on_signals()?;
-    let mut chosen = live::streams(rig, context)?;
+    let interrupted = || anyhow::anyhow!("interrupted");
+    let mut chosen = live::streams(rig, &stop, context)?.ok_or_else(interrupted)?;
     chosen.retain(|facts| streams.contains(&facts.id));
     if chosen.is_empty() {
         let names: Vec<String> = streams.iter().map(ToString::to_string).collect();
         bail!("rig {rig} has none of the calibrated streams {}", names.join(", "));
     }
-    let interrupted = || anyhow::anyhow!("interrupted");
     let mut rounds = Rounds::of_rig(rig, &chosen, &stop, context)?.ok_or_else(interrupted)?;
     let detector = detector(board)?;
     let mut capture = Capture::new(rounds.cameras(), board)?;

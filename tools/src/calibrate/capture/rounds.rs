@@ -53,7 +53,7 @@ struct Recorded {
 }
 
 impl Rounds {
-    /// Opens the source.
+    /// Opens the source; `None` when the end is asked for meanwhile.
     ///
     /// # Errors
     /// When it cannot be read, or no camera has a stream to look at.
@@ -74,8 +74,8 @@ impl Rounds {
                 }))
             }
             Source::Rig(rig) => {
-                let chosen = chosen_live(rig, &live::streams(rig, context)?, named)?;
-                Self::of_rig(rig, &chosen, stop, context)
+                let Some(all) = live::streams(rig, stop, context)? else { return Ok(None) };
+                Self::of_rig(rig, &chosen_live(rig, &all, named)?, stop, context)
             }
         }
     }

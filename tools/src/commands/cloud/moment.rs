@@ -45,7 +45,8 @@ impl Moment {
     /// The newest frame of every stream; `None` when it was interrupted. A running rig has at most half a frame between its streams.
     pub(super) fn live(rig: &RigName, context: &Context) -> Result<Option<Self>> {
         let stop = Stop::on_signals()?;
-        let ids: Vec<StreamId> = live::streams(rig, context)?.into_iter().map(|f| f.id).collect();
+        let Some(facts) = live::streams(rig, &stop, context)? else { return Ok(None) };
+        let ids: Vec<StreamId> = facts.into_iter().map(|f| f.id).collect();
         let mut streams = LiveStreams::open(rig, &ids, context)?;
         let mut newest: Vec<Option<Shot>> = vec![None; ids.len()];
         for _ in 0..PATIENCE {
