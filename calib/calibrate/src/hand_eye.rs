@@ -13,6 +13,8 @@ use depthrig_calib::{Camera, Error, ErrorKind, Result};
 use glam::{DMat3, DVec3};
 use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector3, Vector6};
 
+mod agreement;
+
 /// Where the camera is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Arrangement {
@@ -71,7 +73,8 @@ const MIN_AXIS_SPREAD: f64 = 0.02;
 ///
 /// # Errors
 /// [`ErrorKind::BadInput`] for fewer than three views, for motions without rotation, for rotations about one axis only, and for views
-/// whose corners do not give the board's pose; the message says which motion is missing.
+/// whose corners do not give the board's pose; the message says which motion is missing. Also for four views or more whose poses
+/// contradict each other, as those of other views or of the other arrangement do.
 pub fn hand_eye(
     arrangement: Arrangement,
     intrinsics: &Intrinsics,
@@ -80,9 +83,10 @@ pub fn hand_eye(
 ) -> Result<HandEye> {
     let sights = sights(arrangement, intrinsics, views)?;
     check_motions(&sights)?;
+    let held_out = agreement::held_out(&sights)?;
+    agreement::check(&held_out, &sights, noise)?;
     let mut state = closed_form(&sights)?;
     let covariance = adjust(arrangement, intrinsics, views, noise, &mut state)?;
-    let held_out = held_out(&sights)?;
     let camera = Camera::new(intrinsics)?;
     let mut squares = 0.0;
     let mut count = 0;
@@ -106,6 +110,7 @@ pub fn hand_eye(
 
 /// A view, with both arrangements in one form: `board = motion · camera · camera_from_board`, in which `board` and `camera` are
 /// constant and `motion` is the hand's pose in the base, or its inverse.
+#[derive(Clone, Copy)]
 struct Sight {
     motion: Rigid,
     camera_from_board: Rigid,
@@ -413,26 +418,6 @@ impl Equations {
         let mut block = self.matrix.fixed_view_mut::<6, 6>(at, at);
         block += row * row.transpose();
     }
-}
-
-/// For each view the closed form of the others, and how far this one's board is from theirs.
-fn held_out(sights: &[Sight]) -> Result<Vec<crate::Distance>> {
-    if sights.len() < 4 {
-        return Ok(Vec::new());
-    }
-    (0..sights.len())
-        .map(|i| {
-            let others: Vec<Sight> = sights
-                .iter()
-                .enumerate()
-                .filter(|(k, _)| *k != i)
-                .map(|(_, s)| Sight { motion: s.motion, camera_from_board: s.camera_from_board })
-                .collect();
-            let state = closed_form(&others)?;
-            let seen = sights[i].motion.after(&state.camera).after(&sights[i].camera_from_board);
-            Ok(seen.distance(&state.board))
-        })
-        .collect()
 }
 
 fn bad(message: String) -> Error {

@@ -142,3 +142,36 @@ fn motions_that_leave_something_open_are_refused_with_what_is_missing() {
     assert!(message(&still).contains("turn it by 20 degrees"), "{}", message(&still));
     assert!(message(&one_axis).contains("one axis only"), "{}", message(&one_axis));
 }
+
+#[test]
+fn poses_that_do_not_belong_to_their_views_are_refused_with_what_is_wrong() {
+    let noise = Noise { corner_px: 0.2, robot_m: 0.2e-3, robot_rad: 0.001 };
+    for arrangement in [Arrangement::EyeInHand, Arrangement::EyeToHand] {
+        let good = views(arrangement, 12, 0.2, [0.2e-3, 0.001], &mut Random(5), false);
+        let other = match arrangement {
+            Arrangement::EyeInHand => Arrangement::EyeToHand,
+            Arrangement::EyeToHand => Arrangement::EyeInHand,
+        };
+        let message = |arrangement, poses: &dyn Fn(usize) -> Option<Rigid>| {
+            let views: Vec<HandEyeView> = (0..12)
+                .filter_map(|i| {
+                    poses(i).map(|base_from_hand| HandEyeView { base_from_hand, ..good[i].clone() })
+                })
+                .collect();
+            hand_eye(arrangement, &intrinsics(600.0), &views, &noise).map(|_| ()).map_err(|e| e.to_string())
+        };
+        let pose = |i: usize| good.get(i).map(|v| v.base_from_hand);
+        assert_eq!(message(arrangement, &pose), Ok(()));
+        let said = |poses: &dyn Fn(usize) -> Option<Rigid>| message(arrangement, poses).unwrap_err();
+        let text = message(other, &pose).unwrap_err();
+        assert!(text.contains("--eye-to-hand"), "{text}");
+        let text = said(&|i| pose(i).map(|p| p.inverse()));
+        assert!(text.contains("inverted"), "{text}");
+        let text = said(&|i| pose(i + 1));
+        assert!(text.contains("to the view after it"), "{text}");
+        let text = said(&|i| i.checked_sub(1).and_then(pose));
+        assert!(text.contains("to the view before it"), "{text}");
+        let text = said(&|i| pose((5 * i + 3) % 12));
+        assert!(text.contains("which pose belongs to which view"), "{text}");
+    }
+}

@@ -61,8 +61,8 @@ struct Entry {
 /// named on stderr and stay as they are.
 ///
 /// # Errors
-/// When the calibration cannot be read; a usage error when there is none, when it corrects no stream of the dataset, and when it is of
-/// another device or size.
+/// When the calibration cannot be read; a usage error when the dataset has no calibration, when no stream is corrected by it, and when it
+/// is of another device or size.
 pub fn corrected(dataset: Dataset, file: Option<&Path>) -> Result<Dataset> {
     let (calibration, shown) = match file {
         Some(file) => (super::calibration(file)?, file.display().to_string()),

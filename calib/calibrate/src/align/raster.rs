@@ -266,7 +266,9 @@ mod tests {
                 let render = Render::new(&camera, grid, std::slice::from_ref(&mesh), &nowhere, &[nowhere]);
                 let corners: Vec<Option<(DVec2, f64)>> = vertices
                     .iter()
-                    .map(|v| camera.project(*v).filter(|_| v.z > NEAR_M).map(|p| (grid.in_grid(p), 1.0 / v.z)))
+                    .map(|v| {
+                        camera.project(*v).filter(|_| v.z > NEAR_M).map(|p| (grid.in_grid(p), 1.0 / v.z))
+                    })
                     .collect();
                 for y in 0..grid.height {
                     for x in 0..grid.width {
