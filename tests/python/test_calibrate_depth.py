@@ -184,7 +184,7 @@ offset_mm = {-OFFSET_MM / SCALE}
         daemon.wait(WAIT_S)
     assert "is for 1288x720, the stream has 1280x720" in (tmp_path / "log").read_text()
     (tmp_path / "calibration.toml").write_text(calibration)
-    with running(binary, runtime, tmp_path / "log", "run", str(tmp_path / "rig.toml")):
+    with running(binary, runtime, tmp_path / "log", "run", str(tmp_path / "rig.toml"), codes=(0, 3)):
         streams = {
             name: depthrig.Stream(f"wrong/{name}", runtime_dir=runtime, timeout=WAIT_S)
             for name in ("depth", "depth_refined")

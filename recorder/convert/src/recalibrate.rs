@@ -27,7 +27,7 @@ pub struct CalibrationPlan {
 ///
 /// # Errors
 /// [`ErrorKind::BadInput`] for a calibration of another device or another size of image, and for one that has none of the
-/// dataset's streams.
+/// dataset's streams, neither their cameras nor their depth.
 pub fn plan(
     session: &Session,
     calibration: &Calibration,
@@ -57,14 +57,16 @@ pub fn plan(
             let doubts = entry.entry.conditions.doubts(&now);
             plan.doubts.extend(doubts.into_iter().map(|d| format!("{camera}: {d}")));
         }
-        if entries.is_empty() {
-            plan.left.push((*camera).to_owned());
-        } else {
+        if !entries.is_empty() {
             apply(session, camera, &entries, &calibration.created, &mut plan.change);
+        } else if !calibration.cameras.is_empty() {
+            plan.left.push((*camera).to_owned());
         }
     }
-    if plan.change.streams.is_empty() {
-        let has = calibration.cameras.iter().map(|c| format!("{}/{}", c.name, c.stream));
+    let corrects_depth = corrects_depth(session, calibration, path)?;
+    if plan.change.streams.is_empty() && !corrects_depth {
+        let cameras = calibration.cameras.iter().map(|c| format!("{}/{}", c.name, c.stream));
+        let has = cameras.chain(calibration.depth.iter().map(|d| format!("{}/{}", d.camera, d.stream)));
         let streams = session.streams.iter().map(|s| s.id.to_string());
         return Err(Error::new(
             ErrorKind::BadInput,
@@ -77,6 +79,21 @@ pub fn plan(
         ));
     }
     Ok(plan)
+}
+
+/// Whether the calibration corrects depth of the dataset; refuses corrections of another device or another size of image.
+fn corrects_depth(session: &Session, calibration: &Calibration, path: &Path) -> Result<bool> {
+    let mut corrects = false;
+    for record in &session.streams {
+        let Some(entry) = calibration.depth_of(record.id.camera.as_str(), record.id.stream.as_str()) else {
+            continue;
+        };
+        entry.check_fits(&record.serial, record.width, record.height).map_err(|e| {
+            Error::new(ErrorKind::BadInput, format!("{}: {e}", path.display())).with_source(e)
+        })?;
+        corrects = true;
+    }
+    Ok(corrects)
 }
 
 fn record<'a>(session: &'a Session, entry: &CalibratedCamera) -> Option<&'a StreamRecord> {
