@@ -32,6 +32,7 @@ mod msgs;
 pub mod npy;
 mod options;
 mod outside;
+pub mod preview;
 mod recalibrate;
 mod recorder;
 mod recover;
