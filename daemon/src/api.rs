@@ -6,9 +6,10 @@
 //!
 //! **Who may call.** The socket has mode 0600 in a folder of mode 0700: the user that runs the rig. A port must be
 //! loopback and is open to every user of the computer, so its requests carry a token that only that user can read (file
-//! `RIG.token` beside the socket); `/metrics` needs none. Web pages in that user's browser are kept out by two rules: the
-//! `Host` must be a loopback name (against DNS rebinding), and a POST must be `application/json`, which a page of
-//! another origin may not send without asking first, and nobody answers that question (against CSRF).
+//! `RIG.token` beside the socket); `/metrics` and the files of the live page need none, and the
+//! page's WebSocket has it in its first message. Web pages in that user's browser are kept out by three rules: the `Host` must be a loopback name (against
+//! DNS rebinding), an `Origin` must be this server's (against WebSockets from other pages), and a POST must be `application/json`, which a page
+//! of another origin may not send without asking first, and nobody answers that question (against CSRF).
 //!
 //! **Who may wait.** Socket and port have places of their own, so that nobody on the port can keep the socket from being
 //! answered; heads, bodies and answers have time limits, bodies a size limit.
@@ -17,6 +18,8 @@ mod allowed;
 mod events;
 mod guard;
 mod limits;
+mod live;
+mod page;
 mod reply;
 mod routes;
 mod serve;
@@ -24,6 +27,7 @@ mod socket;
 mod token;
 
 pub use events::{CaptureEvent, MAX_FOLLOWERS};
+pub use page::PageAddress;
 pub(crate) use reply::{ErrorBody, kind_of_name};
 pub use routes::{
     Health, HealthReason, LoopRequest, NoteRequest, OPENAPI, ROUTES, RateRequest, Route, StepRequest,
@@ -31,9 +35,9 @@ pub use routes::{
 pub use serve::ServerHandle;
 
 use crate::Result;
+use crate::config::Port;
 use crate::control::Control;
-use std::net::SocketAddr;
-use std::path::Path;
+use depthrig_bus::{RigName, RuntimeDir};
 use std::sync::Arc;
 
 /// The largest request body, bytes; notes are the longest thing anybody sends.
@@ -43,7 +47,7 @@ pub const MAX_CONNECTIONS: usize = 64;
 /// The header of every answer that names the server: `depthrig/0.1.0`.
 pub const SERVER_HEADER: &str = "server";
 
-/// Serves `control` on the Unix socket `socket` and, if given, on the loopback address `tcp` (port 0: any).
+/// Serves `control`, and the images of its rig, on the rig's Unix socket below `runtime` and on a loopback port.
 ///
 /// The caller holds the rig's lock: only then is a socket file that is already there the rest of a process that
 /// died, and removed. It returns when both accept connections; dropping the handle ends the service.
@@ -51,6 +55,11 @@ pub const SERVER_HEADER: &str = "server";
 /// # Errors
 /// `InUse` when something answers on the socket or the port is taken, `BadInput` for an address that is not
 /// loopback, `PermissionDenied`, `Other`.
-pub fn serve(control: Arc<dyn Control>, socket: &Path, tcp: Option<SocketAddr>) -> Result<ServerHandle> {
-    ServerHandle::start(control, socket, tcp)
+pub fn serve(
+    control: Arc<dyn Control>,
+    runtime: &RuntimeDir,
+    rig: &RigName,
+    port: Port,
+) -> Result<ServerHandle> {
+    ServerHandle::start(control, runtime, rig, port)
 }

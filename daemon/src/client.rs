@@ -6,7 +6,7 @@ mod http;
 #[cfg(test)]
 mod tests;
 
-use crate::api::{self, LoopRequest, NoteRequest, RateRequest, StepRequest};
+use crate::api::{self, LoopRequest, NoteRequest, PageAddress, RateRequest, StepRequest};
 use crate::control::{RecordRequest, SeekRequest};
 use crate::status::{RecordingStatus, ReplayStatus, RigStatus};
 use crate::{Error, ErrorKind, Result};
@@ -88,6 +88,14 @@ impl Client {
     pub fn config(&self) -> Result<String> {
         let answer = self.send("GET", "/v1/config", None, TIMEOUT)?;
         String::from_utf8(answer.body).map_err(|e| self.garbled("/v1/config", &e).with_source(e))
+    }
+
+    /// Where the live page is.
+    ///
+    /// # Errors
+    /// As [`Self::status`].
+    pub fn page(&self) -> Result<PageAddress> {
+        self.get("/v1/page")
     }
 
     /// Starts a recording. A relative folder in `request` is the daemon's, so callers make it absolute.

@@ -29,7 +29,7 @@ use depthrig_bus::{CameraName, Pose, RigName, StreamName};
 use depthrig_calibrate::file::{CalibratedCamera, Calibration, DepthCorrection, lens_position};
 use depthrig_driver::{StreamProfile, StreamRequest};
 use depthrig_stereo::StereoOptions;
-use std::net::SocketAddr;
+use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -132,8 +132,25 @@ pub struct RecordingConfig {
 /// The control API. The Unix socket is always there.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ControlConfig {
-    /// Loopback address that the API is also served on.
-    pub tcp: Option<SocketAddr>,
+    /// Where the API and the live page are also served, for this computer alone.
+    pub tcp: Port,
+}
+
+/// A port on the loopback interface.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Port {
+    /// [`Port::DEFAULT`], or any other if another program, such as another rig, listens there.
+    #[default]
+    Any,
+    /// This address and no other.
+    At(SocketAddr),
+    /// None.
+    Off,
+}
+
+impl Port {
+    /// Where the live page is if nothing else is configured.
+    pub const DEFAULT: SocketAddr = SocketAddr::V4(SocketAddrV4::new(Ipv4Addr::LOCALHOST, 8642));
 }
 
 /// Supervision of the cameras.

@@ -24,6 +24,7 @@ mod sink;
 pub mod stage;
 pub mod status;
 mod stream;
+mod viewers;
 mod wake;
 
 pub use error::{Error, ErrorKind, Result};

@@ -25,7 +25,9 @@ mod timeline;
 mod transport;
 
 use crate::api::{self, ServerHandle};
-use crate::config::{BusConfig, ControlConfig, RecordingConfig, RigConfig, SetsConfig, SupervisorConfig};
+use crate::config::{
+    BusConfig, ControlConfig, Port, RecordingConfig, RigConfig, SetsConfig, SupervisorConfig,
+};
 use crate::control::Control;
 use crate::housekeeping::Housekeeping;
 use crate::recording::{Outside, Recording, Reports};
@@ -210,7 +212,8 @@ impl Replay {
             options.refine.map(|engine| refine::refinements(&inner, &bus, engine)).transpose()?;
         let mut replay = Self { inner, threads: Vec::new(), api: None, _lock: held };
         if options.serve_api {
-            replay.api = Some(api::serve(replay.control(), &runtime.socket_path(&rig), None)?);
+            let port = replay.inner.config.control.tcp;
+            replay.api = Some(api::serve(replay.control(), runtime, &rig, port)?);
         }
         let inner = Arc::clone(&replay.inner);
         replay.spawn("housekeeping", move || housekeeping(&inner, &bus))?;
@@ -314,7 +317,7 @@ fn recording_config(sources: &mut Sources) -> RigConfig {
         bus: BusConfig::default(),
         sets: SetsConfig::default(),
         recording,
-        control: ControlConfig { tcp: None },
+        control: ControlConfig { tcp: Port::Any },
         supervisor: SupervisorConfig::default(),
         cdm: CdmConfig::default(),
         calibration: None,

@@ -212,8 +212,8 @@ impl Rig {
         let mut rig = Self { threads: Vec::new(), recovery: None, api: None, inner, _lock: lock };
         // Before the cameras: a long start can then be asked about.
         if options.serve_api {
-            let socket = options.runtime.socket_path(&rig.inner.config.rig);
-            rig.api = Some(api::serve(rig.control(), &socket, rig.inner.config.control.tcp)?);
+            let config = &rig.inner.config;
+            rig.api = Some(api::serve(rig.control(), &options.runtime, &config.rig, config.control.tcp)?);
         }
         let inner = Arc::clone(&rig.inner);
         rig.spawn("supervisor", move |stop| supervise(&inner, stop))?;

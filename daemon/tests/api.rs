@@ -13,6 +13,7 @@ use depthrig_bus::clock::HostTime;
 use depthrig_bus::{RigName, RuntimeDir};
 use depthrig_daemon::api::{self, MAX_BODY_BYTES, MAX_FOLLOWERS, OPENAPI, ROUTES, ServerHandle};
 use depthrig_daemon::client::Client;
+use depthrig_daemon::config::Port;
 use depthrig_daemon::control::{RecordRequest, SeekRequest};
 use depthrig_daemon::status::CameraState;
 use depthrig_daemon::{Error, ErrorKind};
@@ -43,8 +44,8 @@ fn served() -> Served {
     let rig = RigName::new("mount").unwrap();
     let lock = runtime.lock(&rig, "process 42 (rig.toml)").unwrap();
     let fake = Arc::new(Fake::default());
-    let any_port = Some("127.0.0.1:0".parse().unwrap());
-    let server = api::serve(fake.clone(), &runtime.socket_path(&rig), any_port).unwrap();
+    let any_port = Port::At("127.0.0.1:0".parse().unwrap());
+    let server = api::serve(fake.clone(), &runtime, &rig, any_port).unwrap();
     Served { fake, runtime, rig, server, lock, _tmp: tmp }
 }
 
@@ -160,6 +161,7 @@ fn every_answer_of_a_live_server_fits_the_document() {
     check("GET", "/v1/health", &served.get("/v1/health"), 200);
     check("GET", "/v1/config", &served.get("/v1/config"), 200);
     check("GET", "/metrics", &served.get("/metrics"), 200);
+    check("GET", "/v1/page", &served.get("/v1/page"), 200);
     check("GET", "/v1/openapi.json", &served.get("/v1/openapi.json"), 200);
     for (kind, wanted) in [
         (ErrorKind::NotFound, 404),
@@ -441,23 +443,25 @@ fn the_socket_is_private_and_goes_with_the_server() {
 #[test]
 fn a_dead_daemons_socket_is_replaced_and_nothing_else_is() {
     let tmp = tempfile::tempdir().unwrap();
-    let path = tmp.path().join("r.sock");
+    let runtime = RuntimeDir::at(tmp.path()).unwrap();
+    let rig = RigName::new("r").unwrap();
+    let path = runtime.socket_path(&rig);
     let fake: Arc<Fake> = Arc::default();
     drop(UnixListener::bind(&path).unwrap());
     assert!(path.exists(), "a socket that nobody listens on");
-    let first = api::serve(fake.clone(), &path, None).unwrap();
-    let e = api::serve(fake.clone(), &path, None).unwrap_err();
+    let first = api::serve(fake.clone(), &runtime, &rig, Port::Off).unwrap();
+    let e = api::serve(fake.clone(), &runtime, &rig, Port::Off).unwrap_err();
     assert_eq!(e.kind(), ErrorKind::InUse);
     assert!(e.to_string().contains("another process answers on it"), "{e}");
     // A server whose file was replaced by somebody leaves that file alone.
     std::fs::remove_file(&path).unwrap();
-    let second = api::serve(fake.clone(), &path, None).unwrap();
+    let second = api::serve(fake.clone(), &runtime, &rig, Port::Off).unwrap();
     let inode = std::fs::metadata(&path).unwrap().ino();
     first.stop();
     assert_eq!(std::fs::metadata(&path).unwrap().ino(), inode);
     second.stop();
     std::fs::write(&path, "precious").unwrap();
-    let e = api::serve(fake, &path, None).unwrap_err();
+    let e = api::serve(fake, &runtime, &rig, Port::Off).unwrap_err();
     assert!(e.to_string().contains("a file that is not a socket is in the way"), "{e}");
     assert_eq!(std::fs::read_to_string(&path).unwrap(), "precious");
 }
@@ -465,8 +469,12 @@ fn a_dead_daemons_socket_is_replaced_and_nothing_else_is() {
 #[test]
 fn ports_that_cannot_be_served_say_why() {
     let tmp = tempfile::tempdir().unwrap();
-    let path = tmp.path().join("r.sock");
-    let serve = |address: SocketAddr| api::serve(Arc::<Fake>::default(), &path, Some(address)).unwrap_err();
+    let runtime = RuntimeDir::at(tmp.path()).unwrap();
+    let rig = RigName::new("r").unwrap();
+    let path = runtime.socket_path(&rig);
+    let serve = |address: SocketAddr| {
+        api::serve(Arc::<Fake>::default(), &runtime, &rig, Port::At(address)).unwrap_err()
+    };
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let e = serve(taken.local_addr().unwrap());
     assert_eq!(e.kind(), ErrorKind::InUse);

@@ -6,7 +6,7 @@ use axum::http::{Method, StatusCode, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 
-/// Refuses requests of a port that name another host than this one: a web page whose name was made to point here
+/// Refuses requests that name another host than this one: a web page whose name was made to point here
 /// still sends its own name.
 pub(super) async fn loopback_host(request: Request, next: Next) -> Response {
     let mut hosts = request.headers().get_all(header::HOST).iter();
@@ -19,6 +19,16 @@ pub(super) async fn loopback_host(request: Request, next: Next) -> Response {
     let host = host.unwrap_or_default();
     let message = format!("Host \"{host}\" is not a loopback name; use localhost, 127.0.0.1 or [::1]");
     Refusal::new(StatusCode::FORBIDDEN, message).into_response()
+}
+
+/// Refuses requests of a page that another server sent: a browser names it with each WebSocket and each POST, and programs that are no browsers name none.
+pub(super) async fn own_origin(request: Request, next: Next) -> Response {
+    let headers = request.headers();
+    let own = headers.get(header::HOST).map(|host| [b"http://", host.as_bytes()].concat());
+    let foreign = headers.get(header::ORIGIN).filter(|o| own.as_deref() != Some(o.as_bytes())).cloned();
+    let Some(origin) = foreign else { return next.run(request).await };
+    let message = format!("a page of {} may not use this rig", String::from_utf8_lossy(origin.as_bytes()));
+    Refusal::denied(StatusCode::FORBIDDEN, message).into_response()
 }
 
 /// Refuses a POST that is not JSON, which a web page of another origin could send without being asked.

@@ -16,6 +16,7 @@ use core::task::{Context, Poll};
 use core::time::Duration;
 use std::io::{self, IoSlice};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
+use tokio::sync::watch;
 use tokio::time::Sleep;
 
 /// How long a client may take to send the head of its next request; an idle connection ends after it.
@@ -41,6 +42,12 @@ pub(super) async fn whole_body(request: Request, next: Next) -> Response {
         }
     };
     refusal.into_response()
+}
+
+/// Waits until the service is to end.
+pub(super) async fn end_of(stopped: &mut watch::Receiver<bool>) {
+    // An error means that the handle is gone, which is an end as well.
+    let _ = stopped.wait_for(|stopped| *stopped).await;
 }
 
 /// A stream whose peer must read in time: the clock runs from the first byte that it does not take until it has taken

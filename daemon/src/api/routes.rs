@@ -1,8 +1,9 @@
 //! The calls of the API: one table that the router is built from and the OpenAPI document is compared with.
 
 use super::events::{CaptureEvent, Events};
+use super::page::{self, LIVE, PageAddress};
 use super::reply::Refusal;
-use super::{SERVER_HEADER, allowed, guard, limits};
+use super::{SERVER_HEADER, allowed, guard, limits, live};
 use crate::control::{Control, RecordRequest, ReplayControl, SeekRequest};
 use crate::metrics;
 use crate::status::{CameraState, CameraStatus, RecordingStatus, ReplayStatus, RigStatus};
@@ -38,7 +39,7 @@ pub struct Route {
 const CALIBRATION_EVENTS: &str = "/v1/calibration/events";
 
 /// Every call of the API.
-pub const ROUTES: [Route; 19] = [
+pub const ROUTES: [Route; 20] = [
     Route { method: "GET", path: "/v1/status", handler: || get(status) },
     Route { method: "GET", path: "/v1/health", handler: || get(health) },
     Route { method: "GET", path: "/v1/config", handler: || get(config) },
@@ -56,6 +57,7 @@ pub const ROUTES: [Route; 19] = [
     Route { method: "GET", path: CALIBRATION_EVENTS, handler: || get(calibration_follow) },
     Route { method: "POST", path: CALIBRATION_EVENTS, handler: || post(calibration_post) },
     Route { method: "POST", path: "/v1/stop", handler: || post(stop) },
+    Route { method: "GET", path: "/v1/page", handler: || get(page_address) },
     Route { method: "GET", path: "/v1/openapi.json", handler: || get(openapi) },
     Route { method: "GET", path: "/metrics", handler: || get(scrape) },
 ];
@@ -134,7 +136,9 @@ impl Health {
 
 pub(super) fn router(control: Rig, events: Events) -> Router {
     let router = ROUTES.iter().fold(Router::new(), |router, r| router.route(r.path, (r.handler)()));
+    let router = page::FILES.iter().fold(router, |router, file| router.route(&file.path(), file.handler()));
     router
+        .route(LIVE, get(live::upgrade))
         .fallback(unknown_path)
         .method_not_allowed_fallback(wrong_method)
         .with_state(control)
@@ -257,6 +261,10 @@ async fn stop(State(rig): State<Rig>) -> Answer<StatusCode> {
     })
     .await?;
     Ok(StatusCode::ACCEPTED)
+}
+
+async fn page_address(Extension(address): Extension<PageAddress>) -> Json<PageAddress> {
+    Json(address)
 }
 
 async fn openapi() -> Response {

@@ -1,14 +1,19 @@
 //! The thread that serves: it accepts, keeps connections few and short-lived, and ends within half a second.
 
 use super::events::Events;
-use super::limits::{HEAD_TIMEOUT, Limited, WRITE_TIMEOUT};
+use super::limits::{HEAD_TIMEOUT, Limited, WRITE_TIMEOUT, end_of};
+use super::live::Live;
+use super::page::PageAddress;
 use super::socket::{self, SocketFile};
 use super::token::{self, Token};
 use super::{MAX_CONNECTIONS, guard, routes};
+use crate::config::Port;
 use crate::control::Control;
+use crate::viewers::Viewers;
 use crate::{Error, ErrorKind, Result};
-use axum::Router;
+use axum::{Extension, Router};
 use core::time::Duration;
+use depthrig_bus::{RigName, RuntimeDir};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use std::net::SocketAddr;
@@ -37,13 +42,19 @@ pub struct ServerHandle {
 }
 
 impl ServerHandle {
-    pub(super) fn start(control: Arc<dyn Control>, path: &Path, tcp: Option<SocketAddr>) -> Result<Self> {
+    pub(super) fn start(
+        control: Arc<dyn Control>,
+        runtime_dir: &RuntimeDir,
+        rig: &RigName,
+        port: Port,
+    ) -> Result<Self> {
+        let path = runtime_dir.socket_path(rig);
         let failed = |e: std::io::Error| {
             Error::new(ErrorKind::Other, format!("the control API cannot be served: {e}")).with_source(e)
         };
         // The port first: when it is refused, no socket has come and gone.
-        let port = tcp.map(socket::bind_tcp).transpose()?;
-        let (unix, socket) = socket::bind_unix(path)?;
+        let port = socket::bind_port(port)?;
+        let (unix, socket) = socket::bind_unix(&path)?;
         let tcp = port.as_ref().map(std::net::TcpListener::local_addr).transpose().map_err(failed)?;
         let token = tcp.map(|_| Token::create(path.with_extension("token"))).transpose()?;
         let mut builder = tokio::runtime::Builder::new_current_thread();
@@ -52,12 +63,15 @@ impl ServerHandle {
         let (unix, port) = {
             let _inside = runtime.enter();
             let port = port.map(TcpListener::from_std).transpose().map_err(failed)?;
-            let port = port.zip(token.clone()).map(|(listener, token)| Port { listener, token });
+            let port = port.zip(token.clone()).map(|(listener, token)| OnPort { listener, token });
             (UnixListener::from_std(unix).map_err(failed)?, port)
         };
         let (stop, stopped) = watch::channel(false);
+        let viewers = Viewers::new(runtime_dir.clone(), rig.clone());
+        let address = PageAddress::of(tcp, token.as_deref().map(Token::path));
+        let served = Served { control, viewers, address, stopped };
         let serve = move || {
-            runtime.block_on(run(control, unix, port, stopped));
+            runtime.block_on(run(served, unix, port));
             // A call that is still under way ends by itself; nobody waits for its answer.
             runtime.shutdown_background();
         };
@@ -94,38 +108,54 @@ impl Drop for ServerHandle {
 }
 
 /// A loopback port with the token that its clients must know.
-struct Port {
+struct OnPort {
     listener: TcpListener,
     token: Arc<Token>,
 }
 
-async fn run(
+/// The rig, and what serves it.
+struct Served {
     control: Arc<dyn Control>,
-    unix: UnixListener,
-    port: Option<Port>,
+    viewers: Viewers,
+    address: PageAddress,
     stopped: watch::Receiver<bool>,
-) {
-    let router = routes::router(control, Events::new(stopped.clone()));
+}
+
+async fn run(served: Served, unix: UnixListener, port: Option<OnPort>) {
+    let Served { control, viewers, address, stopped } = served;
+    let pages = Arc::new(Semaphore::new(MAX_CONNECTIONS));
+    let live = |token: Option<Arc<Token>>| {
+        let places = Arc::clone(&pages);
+        Extension(Live { viewers: viewers.clone(), stopped: stopped.clone(), places, token })
+    };
+    let router = routes::router(control, Events::new(stopped.clone()))
+        .layer(Extension(address))
+        .layer(axum::middleware::from_fn(guard::own_origin))
+        .layer(axum::middleware::from_fn(guard::loopback_host));
     // Connections of the port are anybody's on this computer: they must not take the places of the socket.
     let port_places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
     let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
     let on_port = async {
-        if let Some(Port { listener, token }) = port {
+        if let Some(OnPort { listener, token }) = port {
             let guarded = router
                 .clone()
-                .layer(axum::middleware::from_fn_with_state(token, token::bearer))
-                .layer(axum::middleware::from_fn(guard::loopback_host));
+                .layer(live(Some(Arc::clone(&token))))
+                .layer(axum::middleware::from_fn_with_state(token, token::bearer));
             let places = Arc::clone(&port_places);
             let acceptor = Acceptor { places, router: guarded, stopped: stopped.clone() };
             acceptor.run(async || listener.accept().await.map(|(stream, _)| stream)).await;
         }
     };
-    let on_socket =
-        Acceptor { places: Arc::clone(&places), router: router.clone(), stopped: stopped.clone() };
+    let on_socket = Acceptor {
+        places: Arc::clone(&places),
+        router: router.clone().layer(live(None)),
+        stopped: stopped.clone(),
+    };
     tokio::join!(on_port, on_socket.run(async || unix.accept().await.map(|(stream, _)| stream)));
     let all = async {
         let _ = places.acquire_many(MAX_CONNECTIONS as u32).await;
         let _ = port_places.acquire_many(MAX_CONNECTIONS as u32).await;
+        let _ = pages.acquire_many(MAX_CONNECTIONS as u32).await;
     };
     if tokio::time::timeout(STOP_TIMEOUT, all).await.is_err() {
         tracing::debug!("requests under way were cut off because the rig ends");
@@ -167,12 +197,6 @@ impl Acceptor {
     }
 }
 
-/// Waits until the service is to end.
-async fn end_of(stopped: &mut watch::Receiver<bool>) {
-    // An error means that the handle is gone, which is an end as well.
-    let _ = stopped.wait_for(|stopped| *stopped).await;
-}
-
 /// Answers the requests of one connection. A client that goes away or talks nonsense concerns only itself.
 async fn converse<S>(stream: S, router: Router, mut stopped: watch::Receiver<bool>)
 where
@@ -181,7 +205,7 @@ where
     let mut http = hyper::server::conn::http1::Builder::new();
     http.timer(TokioTimer::new()).header_read_timeout(HEAD_TIMEOUT);
     let stream = TokioIo::new(Limited::new(stream, WRITE_TIMEOUT));
-    let connection = http.serve_connection(stream, TowerToHyperService::new(router));
+    let connection = http.serve_connection(stream, TowerToHyperService::new(router)).with_upgrades();
     tokio::pin!(connection);
     let ended = tokio::select! {
         ended = connection.as_mut() => ended,

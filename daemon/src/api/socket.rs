@@ -1,5 +1,6 @@
 //! Binding the two places where the API is served.
 
+use crate::config::Port;
 use crate::{Error, ErrorKind, Result};
 use rustix::fs::{FileType, Mode};
 use std::io;
@@ -57,8 +58,24 @@ fn make_way(path: &Path) -> Result<()> {
     })
 }
 
+/// Binds the configured port. With [`Port::Any`] a rig runs without one if no port is free.
+pub(super) fn bind_port(port: Port) -> Result<Option<TcpListener>> {
+    match port {
+        Port::Off => Ok(None),
+        Port::At(address) => bind_tcp(address).map(Some),
+        Port::Any => {
+            let another = SocketAddr::new(Port::DEFAULT.ip(), 0);
+            let bound = bind_tcp(Port::DEFAULT).or_else(|_| bind_tcp(another));
+            if let Err(e) = &bound {
+                tracing::warn!(error = %e, "the live page is not served");
+            }
+            Ok(bound.ok())
+        }
+    }
+}
+
 /// Binds the loopback address `address`.
-pub(super) fn bind_tcp(address: SocketAddr) -> Result<TcpListener> {
+fn bind_tcp(address: SocketAddr) -> Result<TcpListener> {
     if !address.ip().is_loopback() {
         let message =
             format!("control address {address} is not loopback; the API is not encrypted, use 127.0.0.1");

@@ -1,6 +1,7 @@
 //! The token that requests over TCP must carry: other users of this computer reach the port, and only the user that runs
 //! the rig can read the token's file.
 
+use super::page::{self, LIVE};
 use super::reply::Refusal;
 use crate::{Error, ErrorKind, Result};
 use axum::extract::{Request, State};
@@ -15,7 +16,8 @@ use std::sync::Arc;
 
 /// Random bytes of a token.
 const BYTES: usize = 32;
-/// The only path that a port serves without a token: numbers for Prometheus, which runs as a user of its own.
+/// Served without a token: numbers for Prometheus, which runs as a user of its own. So are the files of the live page, which have no secret, and its WebSocket,
+/// whose first message has the token.
 const OPEN_PATH: &str = "/metrics";
 
 /// A token with its file, which goes with it.
@@ -51,7 +53,7 @@ impl Token {
     }
 
     /// Compares without ending at the first difference, so that the time taken says nothing about the token.
-    fn is(&self, given: &str) -> bool {
+    pub(super) fn is(&self, given: &str) -> bool {
         let ours = self.text.as_bytes();
         let theirs = given.as_bytes();
         let differ = ours.iter().zip(theirs).fold(0, |sum, (a, b)| sum | (a ^ b));
@@ -91,7 +93,8 @@ fn write_new(path: &Path) -> io::Result<String> {
 
 /// Refuses requests of a port without the token.
 pub(super) async fn bearer(State(token): State<Arc<Token>>, request: Request, next: Next) -> Response {
-    if request.uri().path() == OPEN_PATH || token.allows(&request) {
+    let path = request.uri().path();
+    if path == OPEN_PATH || path == LIVE || page::is_page(path) || token.allows(&request) {
         return next.run(request).await;
     }
     let message = format!(

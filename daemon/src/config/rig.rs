@@ -3,12 +3,11 @@
 use super::read::{FromToml, Report, Section};
 use super::value::{above_zero, not_empty, rate, resolve, within};
 use super::{
-    BusConfig, ColorCodec, ConfigError, ControlConfig, DepthCodec, MAX_CAMERAS, Phase, RecordingConfig,
+    BusConfig, ColorCodec, ConfigError, ControlConfig, DepthCodec, MAX_CAMERAS, Phase, Port, RecordingConfig,
     RigConfig, SetsConfig, SupervisorConfig, camera, refine,
 };
 use crate::family::Family;
 use depthrig_bus::RigName;
-use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use toml::de::DeTable;
 
@@ -128,8 +127,8 @@ fn recording(top: &Section<'_, '_>, base: &Path) -> RecordingConfig {
 
 fn control(top: &Section<'_, '_>) -> ControlConfig {
     let s = top.table("control", "[control]");
-    let tcp = s.or("tcp", None, |tcp: &Option<SocketAddr>| match tcp {
-        Some(a) if !a.ip().is_loopback() => Err(format!(
+    let tcp = s.or("tcp", Port::Any, |tcp: &Port| match tcp {
+        Port::At(a) if !a.ip().is_loopback() => Err(format!(
             "must be a loopback address such as 127.0.0.1:{}, not {a}: the API is not encrypted; forward a port over SSH \
              instead",
             a.port()
@@ -203,11 +202,14 @@ impl FromToml for PathBuf {
     }
 }
 
-impl FromToml for SocketAddr {
+impl FromToml for Port {
     fn from_toml(value: &toml::de::DeValue<'_>) -> Result<Self, String> {
         let text = String::from_toml(value)?;
-        text.parse().map_err(|_| {
-            format!("must be an address and a port such as \"127.0.0.1:8642\"; it is \"{text}\"")
+        if text == "off" {
+            return Ok(Self::Off);
+        }
+        text.parse().map(Self::At).map_err(|_| {
+            format!("must be an address and a port such as \"127.0.0.1:8642\", or \"off\"; it is \"{text}\"")
         })
     }
 }

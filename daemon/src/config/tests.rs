@@ -174,7 +174,7 @@ fn what_a_file_says_is_what_comes_out() {
         (rig.recording.color, rig.recording.depth, rig.recording.workers, rig.recording.segment_max_s),
         (ColorCodec::Png, DepthCodec::Rank, 3, 5)
     );
-    assert_eq!(rig.control.tcp, Some("[::1]:8000".parse().unwrap()));
+    assert_eq!(rig.control.tcp, Port::At("[::1]:8000".parse().unwrap()));
     let a = rig.camera("a").unwrap();
     let settings = FilesConfig { manifest: "/rigs/images".into(), rate_hz: Some(15.0), looped: Some(false) };
     assert_eq!(a.backend, BackendConfig::new(settings));

@@ -1,0 +1,79 @@
+/** Keys of the page: a table, and what is left to the control that has the focus. */
+
+/**
+ * @typedef {Object} KeyTarget what of the focused element matters
+ * @property {boolean} isText it takes text
+ * @property {boolean} takesSpace Space presses it
+ * @property {boolean} takesEnter Enter presses it
+ * @property {boolean} takesArrows arrows move it
+ * @property {boolean} isInDialog
+ *
+ * @typedef {{action: "toggleRecord" | "note" | "back" | "help" | "enlarge" | "playPause"}
+ *   | {action: "step", sets: number} | {action: "camera", n: number}} KeyAction
+ */
+
+const TEXT_INPUTS = ["text", "search", "number", "email", "url", "password", "tel"];
+
+/**
+ * @param {EventTarget | null} target
+ * @returns {KeyTarget}
+ */
+export function keyTarget(target) {
+  const element = target instanceof HTMLElement ? target : null;
+  const type = element instanceof HTMLInputElement ? element.type : "";
+  const isSelect = element instanceof HTMLSelectElement;
+  const isButton = element instanceof HTMLButtonElement;
+  const isEditable = element instanceof HTMLTextAreaElement || (element?.isContentEditable ?? false);
+  return {
+    isText: TEXT_INPUTS.includes(type) || isEditable,
+    takesSpace: isButton || isSelect || type === "checkbox",
+    takesEnter: isButton || isSelect,
+    takesArrows: type === "range" || isSelect,
+    isInDialog: element !== null && element.closest("dialog") !== null,
+  };
+}
+
+/**
+ * The action of a key; `null` when it is not the page's.
+ *
+ * @param {{key: string, repeat: boolean, ctrlKey: boolean, altKey: boolean, metaKey: boolean}} event
+ * @param {KeyTarget} target
+ * @returns {KeyAction | null}
+ */
+export function actionOf(event, target) {
+  if (event.ctrlKey || event.altKey || event.metaKey || target.isInDialog) {
+    return null;
+  }
+  if (target.isText) {
+    return null;
+  }
+  const isArrow = event.key === "ArrowLeft" || event.key === "ArrowRight";
+  if (isArrow) {
+    return target.takesArrows ? null : { action: "step", sets: event.key === "ArrowLeft" ? -1 : 1 };
+  }
+  // A key that is held, or a pedal that bounces, must not start and stop again and again.
+  if (event.repeat) {
+    return null;
+  }
+  if (/^[1-9]$/.test(event.key)) {
+    return { action: "camera", n: Number(event.key) };
+  }
+  switch (event.key) {
+    case " ":
+      return target.takesSpace ? null : { action: "toggleRecord" };
+    case "Enter":
+      return target.takesEnter ? null : { action: "enlarge" };
+    case "Escape":
+      return { action: "back" };
+    case "?":
+      return { action: "help" };
+    case "n":
+    case "N":
+      return { action: "note" };
+    case "p":
+    case "P":
+      return { action: "playPause" };
+    default:
+      return null;
+  }
+}

@@ -1,0 +1,222 @@
+/** Puts the page together. */
+
+import { takeToken } from "./api.js";
+import { Blend } from "./blend.js";
+import { Connection } from "./connection.js";
+import { announce, byId, releaseFocusAfterClicks, setState, setText } from "./dom.js";
+import { Hover } from "./hover.js";
+import { actionOf, keyTarget } from "./keys.js";
+import { TileLabels } from "./labels.js";
+import { PROTOCOL } from "./protocol.js";
+import { DepthRange } from "./range.js";
+import { RecordBar } from "./recordbar.js";
+import { ReplayBar } from "./replaybar.js";
+import { play, setUpSound } from "./sound.js";
+import { Wall } from "./wall.js";
+
+/** @typedef {import("./types.js").Status} Status */
+/** @typedef {import("./types.js").Hello} Hello */
+
+const STATE_EVERY_MS = 100;
+const KEPT_AGES = 200;
+const PROBLEM_MS = 5000;
+
+/**
+ * For tests and for a look from the console.
+ *
+ * @type {{drawn: number, ages: number[]}}
+ */
+const debug = { drawn: 0, ages: [] };
+Object.assign(window, { depthrig: debug });
+
+/** @type {Status | null} */
+let status = null;
+
+const range = new DepthRange(() => wall.redrawAll((tile) => tile.isDepth || tile === wall.enlarged));
+const blend = new Blend(() => {
+  wall.redrawAll((tile) => tile === wall.enlarged);
+  wall.askWatch();
+});
+const wall = new Wall({
+  watch: (watched) => connection.watch(watched),
+  tables: range.tables,
+  onEnlarged: (tile) => {
+    blend.enlarged(wall.tiles.values(), tile);
+    // Marks were set for tiles of another size.
+    hover.hide();
+  },
+  blendOf: (tile) => blend.of(tile),
+  onDrawn: (tile, ageMs) => {
+    debug.drawn += 1;
+    debug.ages.push(ageMs);
+    if (debug.ages.length > KEPT_AGES) {
+      debug.ages.shift();
+    }
+    labels.drawn(tile, ageMs);
+  },
+});
+const labels = new TileLabels(wall);
+const hover = new Hover(wall.tiles, (id, place) => connection.askPixel(id, place));
+const recordBar = new RecordBar();
+const replayBar = new ReplayBar();
+
+const connection = new Connection({
+  onState: showConnection,
+  onHello: welcome,
+  onStatus: showStatus,
+  onImage: (image, credit) => wall.accept(image, credit),
+  onPixel: (answer) => hover.answer(answer),
+  onProblem: showProblem,
+});
+
+/**
+ * @param {import("./connection.js").ConnectionState} state
+ * @param {string} text
+ */
+function showConnection(state, text) {
+  const box = byId("connection", HTMLElement);
+  if (state === "lost" && box.dataset.state === "live") {
+    play("error");
+  }
+  setState(box, state);
+  setText(box, text);
+  recordBar.setLive(state === "live");
+  if (state === "live") {
+    wall.reconnect();
+  } else {
+    hover.hide();
+  }
+  showTiles();
+}
+
+/** @param {Hello} hello */
+function welcome(hello) {
+  const own = document.querySelector("meta[name=depthrig-version]")?.getAttribute("content") ?? "";
+  const isOther = hello.version !== own || hello.protocol !== PROTOCOL;
+  byId("version-note", HTMLElement).hidden = !isOther;
+  const versions = `This page is of depthrig ${own}, the daemon of ${hello.version}.`;
+  const protocols = `This page speaks protocol ${PROTOCOL}, the daemon ${hello.protocol}.`;
+  setText(byId("version-text", HTMLElement), hello.version === own ? protocols : versions);
+  setText(byId("rig", HTMLElement), hello.rig);
+  document.title = `${hello.rig}${hello.is_replay ? " (replay)" : ""} · depthrig`;
+  replayBar.show(hello.is_replay);
+}
+
+/** @param {Status} next */
+function showStatus(next) {
+  soundForCameras(next);
+  status = next;
+  wall.build(next.cameras);
+  for (const camera of next.cameras) {
+    for (const stream of camera.streams) {
+      const tile = wall.tiles.get(stream.id);
+      if (tile !== undefined) {
+        tile.stream = stream;
+      }
+    }
+  }
+  recordBar.update(next);
+  replayBar.update(next.replay);
+  setText(byId("preparing", HTMLElement), preparingText(next));
+  const { sets } = next;
+  setText(byId("sets", HTMLElement), sets.sent === 0 ? "" : `${sets.sent} sets, ${sets.incomplete} incomplete`);
+}
+
+/** @param {Status} next */
+function preparingText(next) {
+  const { preparing } = next;
+  if (!preparing) {
+    return "";
+  }
+  return preparing.error ?? `The simulated scenes are rendered: ${Math.floor(preparing.share * 100)} %`;
+}
+
+/** @param {Status} next */
+function soundForCameras(next) {
+  for (const camera of next.cameras) {
+    const before = status?.cameras.find(({ name }) => name === camera.name);
+    const hasFailed = camera.state === "failed" || camera.state === "reconnecting";
+    if (before?.state === "streaming" && hasFailed) {
+      play("error");
+      announce(`Camera ${camera.name} failed: ${camera.message ?? camera.state}`);
+    }
+  }
+}
+
+/** @param {string} message */
+function showProblem(message) {
+  const box = byId("problem", HTMLElement);
+  setText(box, message);
+  setTimeout(() => box.textContent === message && setText(box, ""), PROBLEM_MS);
+}
+
+function showTiles() {
+  const now = performance.now();
+  if (document.hidden || status === null) {
+    return;
+  }
+  range.follow(wall.tiles.values(), now);
+  const facts = {
+    cameras: status.cameras,
+    isLive: connection.isLive,
+    isReplay: replayBar.isShown,
+    isPaused: replayBar.isShown && replayBar.isWaiting,
+    fastestHz: replayBar.isShown ? replayBar.fastestHz : Infinity,
+    preparing: preparingText(status),
+  };
+  labels.show(facts, now);
+}
+
+/** @param {import("./keys.js").KeyAction} action */
+function act(action) {
+  switch (action.action) {
+    case "toggleRecord":
+      return recordBar.toggle();
+    case "note":
+      return recordBar.focusNotes();
+    case "back":
+      return wall.enlarge(null);
+    case "help":
+      return byId("help", HTMLDialogElement).showModal();
+    case "camera":
+      return wall.enlargeCamera(action.n);
+    case "enlarge": {
+      const focused = document.activeElement;
+      const id = focused instanceof HTMLElement ? focused.dataset.stream : undefined;
+      const tile = wall.tiles.get(id ?? "");
+      return tile === undefined ? undefined : wall.enlarge(tile);
+    }
+    case "playPause":
+      return replayBar.isShown ? replayBar.togglePause() : undefined;
+    case "step":
+      return replayBar.isShown ? replayBar.step(action.sets) : undefined;
+  }
+}
+
+function setUpKeys() {
+  document.addEventListener("keydown", (event) => {
+    const target = keyTarget(event.target);
+    if (event.key === "Escape" && target.isText && event.target instanceof HTMLElement) {
+      event.target.blur();
+      return;
+    }
+    const action = actionOf(event, target);
+    if (action !== null) {
+      // Space would scroll, and N would be typed into the field that it opens.
+      event.preventDefault();
+      act(action);
+    }
+  });
+}
+
+releaseFocusAfterClicks();
+setUpKeys();
+setUpSound();
+byId("show-help", HTMLButtonElement).addEventListener("click", () => byId("help", HTMLDialogElement).showModal());
+byId("close-help", HTMLButtonElement).addEventListener("click", () => byId("help", HTMLDialogElement).close());
+byId("reload", HTMLButtonElement).addEventListener("click", () => location.reload());
+// A new address in the same tab changes the fragment only, and loads nothing.
+addEventListener("hashchange", () => connection.open(takeToken()));
+
+setInterval(showTiles, STATE_EVERY_MS);
+connection.open(takeToken());

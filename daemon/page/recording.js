@@ -1,0 +1,119 @@
+/** What the status says about the recording: state, rate and new losses, from one status to the next. */
+
+import { lossesSince, sumOf, total } from "./words.js";
+
+/** @typedef {import("./types.js").Status} Status */
+/** @typedef {import("./types.js").RecordingStatus} RecordingStatus */
+/** @typedef {"idle" | "recording" | "closing"} RecordState */
+/** @typedef {{utcNs: number, bytes: number}} Sample */
+
+const RATE_OVER_NS = 5e9;
+
+/**
+ * @typedef {Object} RecordFacts
+ * @property {RecordState} state
+ * @property {number | null} bytesPerSecond `null` before it is known
+ * @property {import("./words.js").Losses} sets lost
+ * @property {import("./words.js").Losses} frames lost since the recording began, or since this page saw it first
+ * @property {boolean} hasNewLosses since the status before, while recording
+ */
+
+/**
+ * Whether a status is older than the answer to a start or a stop. It may come after it, since it waits on its
+ * connection behind images.
+ *
+ * @param {RecordingStatus} answer
+ * @param {Status} status
+ */
+export function isOlder(answer, status) {
+  if (answer.active) {
+    return status.utc_ns < answer.started_utc_ns;
+  }
+  return status.recording !== null && status.recording.path === answer.path && status.recording.active;
+}
+
+export class RecordingWatch {
+  /** The recording that the numbers are of: its folder. */
+  #path = "";
+  #duration = -1;
+  #utcNs = 0;
+  #hasSeenClosing = false;
+  #lost = 0;
+  /** @type {import("./words.js").Losses} */
+  #framesBefore = {};
+  /** @type {Sample[]} */
+  #samples = [];
+
+  /**
+   * @param {Status} status
+   * @param {boolean} isStopping whether this page waits for the answer to its own stop
+   * @returns {RecordFacts}
+   */
+  follow(status, isStopping) {
+    const { recording } = status;
+    const framesNow = sumOf(status.cameras.flatMap((camera) => camera.streams.map((stream) => stream.dropped)));
+    const isNew = recording !== null && recording.path !== this.#path;
+    if (recording === null || isNew) {
+      this.#begin(recording, framesNow);
+    }
+    if (recording === null) {
+      return { state: "idle", bytesPerSecond: null, sets: {}, frames: {}, hasNewLosses: false };
+    }
+    const state = this.#stateOf(recording, status.utc_ns, isStopping);
+    const frames = recording.active ? lossesSince(framesNow, this.#framesBefore) : {};
+    const lost = total(recording.dropped) + total(frames);
+    const hasNewLosses = recording.active && !isNew && lost > this.#lost;
+    this.#lost = recording.active ? lost : 0;
+    const bytesPerSecond = this.#rate(recording, status.utc_ns);
+    return { state, bytesPerSecond, sets: recording.dropped, frames, hasNewLosses };
+  }
+
+  /**
+   * @param {RecordingStatus | null} recording
+   * @param {import("./words.js").Losses} framesNow
+   */
+  #begin(recording, framesNow) {
+    this.#path = recording?.path ?? "";
+    this.#duration = -1;
+    this.#hasSeenClosing = false;
+    this.#lost = 0;
+    this.#framesBefore = framesNow;
+    this.#samples = [];
+  }
+
+  /**
+   * Another client's stop shows only in this: the recording is active, and its time stands still.
+   *
+   * @param {RecordingStatus} recording
+   * @param {number} utcNs
+   * @param {boolean} isStopping
+   * @returns {RecordState}
+   */
+  #stateOf(recording, utcNs, isStopping) {
+    const stands = recording.duration_s === this.#duration && utcNs !== this.#utcNs;
+    if (recording.duration_s !== this.#duration) {
+      this.#hasSeenClosing = false;
+    }
+    this.#hasSeenClosing ||= stands;
+    this.#duration = recording.duration_s;
+    this.#utcNs = utcNs;
+    if (!recording.active) {
+      return "idle";
+    }
+    return isStopping || this.#hasSeenClosing ? "closing" : "recording";
+  }
+
+  /**
+   * @param {RecordingStatus} recording
+   * @param {number} utcNs
+   */
+  #rate(recording, utcNs) {
+    this.#samples.push({ utcNs, bytes: recording.bytes });
+    while (this.#samples.length > 2 && utcNs - this.#samples[0].utcNs > RATE_OVER_NS) {
+      this.#samples.shift();
+    }
+    const first = this.#samples[0];
+    const seconds = (utcNs - first.utcNs) / 1e9;
+    return recording.active && seconds >= 1 ? Math.max(0, recording.bytes - first.bytes) / seconds : null;
+  }
+}

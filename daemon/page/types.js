@@ -1,0 +1,102 @@
+/**
+ * The parts of `GET /v1/status` that the page shows (daemon/src/status.rs), and what goes over `/v1/live`.
+ *
+ * @typedef {Object} StreamStatus
+ * @property {string} id `camera/stream`
+ * @property {string} format
+ * @property {number} width
+ * @property {number} height
+ * @property {number} nominal_hz
+ * @property {number} rate_hz
+ * @property {number | null} [samples_hz] set for an IMU, which has no images
+ * @property {Record<string, number>} dropped
+ * @property {number | null} last_frame_age_ms
+ *
+ * @typedef {"opening" | "streaming" | "stalled" | "reconnecting" | "failed" | "finished" | "stopped"} CameraState
+ *
+ * @typedef {Object} CameraStatus
+ * @property {string} name
+ * @property {CameraState} state
+ * @property {string | null} message
+ * @property {string[]} [warnings]
+ * @property {number} reconnects
+ * @property {StreamStatus[]} streams
+ *
+ * @typedef {Object} RecordingStatus
+ * @property {boolean} active
+ * @property {string} path
+ * @property {string} name
+ * @property {string} scene
+ * @property {string} operator
+ * @property {number} started_utc_ns
+ * @property {number} duration_s
+ * @property {number} sets
+ * @property {Record<string, number>} dropped
+ * @property {number} bytes
+ * @property {number} backlog_bytes
+ * @property {string | null} error
+ * @property {number} disk_free_bytes
+ * @property {number | null} disk_seconds_left
+ * @property {string | null} [warning]
+ *
+ * @typedef {Object} ReplayStatus
+ * @property {string[]} datasets
+ * @property {boolean} paused
+ * @property {boolean} done
+ * @property {number} position_s
+ * @property {number} length_s
+ * @property {number | null} set
+ * @property {number} length_sets
+ * @property {number} rate
+ * @property {boolean} as_fast_as_possible
+ * @property {boolean} loop
+ * @property {string | null} waiting_for
+ * @property {string[]} lost
+ *
+ * @typedef {Object} Status
+ * @property {string} rig
+ * @property {string} version
+ * @property {number} utc_ns
+ * @property {{share: number, error: string | null} | null} preparing
+ * @property {CameraStatus[]} cameras
+ * @property {{nominal_hz: number, sent: number, incomplete: number, spread_p50_ms: number}} sets
+ * @property {RecordingStatus | null} recording
+ * @property {number} cpu_cores
+ * @property {ReplayStatus | null} replay
+ *
+ * @typedef {Object} Hello
+ * @property {number} protocol
+ * @property {string} version
+ * @property {string} rig
+ * @property {boolean} is_replay
+ *
+ * @typedef {{stream: string, width: number, rate_hz: number}} Watch
+ *
+ * @typedef {{stream: string, x: number, y: number}} Place
+ *
+ * @typedef {Object} PixelAnswer
+ * @property {number} id
+ * @property {string} stream
+ * @property {number} x
+ * @property {number} y
+ * @property {number | null} depth_m null where depth is missing
+ * @property {[number, number, number] | null} [xyz_m]
+ * @property {Place[]} seen
+ *
+ * @typedef {Object} Image
+ * @property {"jpeg" | "depth"} kind
+ * @property {number} index of its stream in the `watch` list
+ * @property {number} step
+ * @property {number} columns
+ * @property {number} rows
+ * @property {number} fullColumns
+ * @property {number} fullRows
+ * @property {bigint} sequence
+ * @property {bigint} captureNs
+ * @property {number} ageMs when it was sent
+ * @property {number} unitM metres of one unit of depth
+ * @property {number} watch number of the `watch` message that it answers
+ * @property {ArrayBuffer} message the whole message; the payload follows the head
+ */
+
+export {};

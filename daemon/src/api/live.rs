@@ -1,0 +1,233 @@
+//! The WebSocket of the live page: status, images, and questions about pixels. docs/live-page.md describes its messages.
+
+use super::limits::end_of;
+use super::reply::Refusal;
+use super::token::Token;
+use crate::control::Control;
+use crate::status::RigStatus;
+use crate::viewers::{Message, PROTOCOL, PixelAnswer, PixelQuestion, Place, Viewers, Watch};
+use axum::Extension;
+use axum::extract::State;
+use axum::extract::ws::{CloseFrame, Message as Frame, WebSocket, WebSocketUpgrade};
+use axum::http::StatusCode;
+use axum::response::{IntoResponse, Response};
+use core::time::Duration;
+use serde::{Deserialize, Serialize};
+use std::sync::Arc;
+use tokio::sync::{Semaphore, mpsc, watch};
+use tokio::time::{Instant, MissedTickBehavior, interval};
+
+/// Time for the first message, which has the token.
+const TOKEN_TIMEOUT: Duration = Duration::from_secs(5);
+/// Between two messages with the status.
+const STATUS_PERIOD: Duration = Duration::from_millis(500);
+/// The longest message of a client, bytes: 64 streams with their names.
+const MAX_MESSAGE_BYTES: usize = 16 << 10;
+/// A client that sends nothing for so long, not even an answer to a ping, has gone.
+const SILENCE: Duration = Duration::from_secs(20);
+const PING_PERIOD: Duration = Duration::from_secs(5);
+
+/// Reasons for which the server closes; 4000 and more are an application's own (RFC 6455).
+mod code {
+    pub(super) const STOPPED: u16 = 1001;
+    pub(super) const BAD_MESSAGE: u16 = 4400;
+    pub(super) const DENIED: u16 = 4401;
+    pub(super) const NO_TOKEN: u16 = 4408;
+    pub(super) const FULL: u16 = 4429;
+}
+
+/// The surroundings of a connection of the live page.
+#[derive(Clone)]
+pub(super) struct Live {
+    /// Those who look at the rig.
+    pub(super) viewers: Viewers,
+    /// True when the service ends.
+    pub(super) stopped: watch::Receiver<bool>,
+    /// One for each connection: what has been upgraded has left the places of the API.
+    pub(super) places: Arc<Semaphore>,
+    /// The token that the client has to know; `None` on the socket, which only the user that runs the rig can open.
+    pub(super) token: Option<Arc<Token>>,
+}
+
+/// A message of the client.
+#[derive(Debug, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Request {
+    Token(String),
+    Watch(Vec<Watch>),
+    Credit(u32),
+    Pixel(PixelQuestion),
+}
+
+/// A text message to the client.
+#[derive(Debug, Serialize)]
+#[serde(rename_all = "snake_case")]
+enum Answer<'a> {
+    Hello(Hello<'a>),
+    Status(&'a RigStatus),
+    Pixel(PixelAnswer),
+    Problem { message: String },
+}
+
+#[derive(Debug, Serialize)]
+struct Hello<'a> {
+    protocol: u16,
+    version: &'static str,
+    rig: &'a str,
+    is_replay: bool,
+}
+
+/// Why a connection ends.
+struct End {
+    code: u16,
+    reason: String,
+}
+
+impl End {
+    fn new(code: u16, reason: impl Into<String>) -> Self {
+        Self { code, reason: reason.into() }
+    }
+}
+
+/// Takes the connection over.
+pub(super) async fn upgrade(
+    upgrade: Result<WebSocketUpgrade, axum::extract::ws::rejection::WebSocketUpgradeRejection>,
+    State(rig): State<Arc<dyn Control>>,
+    Extension(live): Extension<Live>,
+) -> Response {
+    let Ok(held) = Arc::clone(&live.places).try_acquire_owned() else {
+        return Refusal::new(StatusCode::SERVICE_UNAVAILABLE, "too many pages are open; close one")
+            .into_response();
+    };
+    match upgrade {
+        Ok(upgrade) => upgrade.max_message_size(MAX_MESSAGE_BYTES).on_upgrade(async move |socket| {
+            serve(socket, rig, live).await;
+            drop(held);
+        }),
+        Err(_) => Refusal::new(StatusCode::BAD_REQUEST, "this is a WebSocket; the live page (/) opens it")
+            .into_response(),
+    }
+}
+
+async fn serve(mut socket: WebSocket, rig: Arc<dyn Control>, live: Live) {
+    let end = match begin(&mut socket, &*rig, &live).await {
+        Ok(client) => client.serve(&mut socket, rig, live.stopped).await,
+        Err(end) => Some(end),
+    };
+    if let Some(End { code, reason }) = end {
+        // A reason longer than a control frame takes is cut off, at a character.
+        let reason: String = reason.chars().take(40).collect::<String>()
+            + if reason.chars().count() > 40 { "…" } else { "" };
+        let _ = socket.send(Frame::Close(Some(CloseFrame { code, reason: reason.into() }))).await;
+    }
+}
+
+/// Checks the token and finds a place.
+async fn begin(socket: &mut WebSocket, rig: &dyn Control, live: &Live) -> Result<Client, End> {
+    if let Some(token) = &live.token {
+        let first = tokio::time::timeout(TOKEN_TIMEOUT, socket.recv()).await;
+        match first {
+            Err(_) => return Err(End::new(code::NO_TOKEN, "no token came")),
+            Ok(Some(Ok(Frame::Text(text)))) => match serde_json::from_str(&text) {
+                Ok(Request::Token(given)) if token.is(&given) => {}
+                _ => return Err(End::new(code::DENIED, "the token is wrong")),
+            },
+            Ok(_) => return Err(End::new(code::DENIED, "the token is missing")),
+        }
+    }
+    let Some((place, messages)) = live.viewers.enter() else {
+        return Err(End::new(code::FULL, format!("{} pages are open already", crate::viewers::MAX_VIEWERS)));
+    };
+    let hello = Hello {
+        protocol: PROTOCOL,
+        version: env!("CARGO_PKG_VERSION"),
+        rig: live.viewers.rig().as_str(),
+        is_replay: rig.replay().is_some(),
+    };
+    send(socket, &Answer::Hello(hello)).await.map_err(|_| End::new(code::STOPPED, ""))?;
+    Ok(Client { place, messages })
+}
+
+/// A client that may look.
+struct Client {
+    place: Place,
+    messages: mpsc::Receiver<Message>,
+}
+
+impl Client {
+    /// Serves until one side ends; `None` when the client has gone.
+    async fn serve(
+        mut self,
+        socket: &mut WebSocket,
+        rig: Arc<dyn Control>,
+        mut stopped: watch::Receiver<bool>,
+    ) -> Option<End> {
+        let mut status = interval(STATUS_PERIOD);
+        status.set_missed_tick_behavior(MissedTickBehavior::Skip);
+        let mut ping = interval(PING_PERIOD);
+        let mut heard = Instant::now();
+        loop {
+            let sent = tokio::select! {
+                () = end_of(&mut stopped) => return Some(End::new(code::STOPPED, "the rig ends")),
+                received = socket.recv() => {
+                    heard = Instant::now();
+                    match received {
+                        Some(Ok(Frame::Text(text))) => match self.take(&text) {
+                            Ok(None) => Ok(()),
+                            Ok(Some(message)) => send(socket, &Answer::Problem { message }).await,
+                            Err(end) => return Some(end),
+                        },
+                        Some(Ok(Frame::Binary(_))) => return Some(End::new(code::BAD_MESSAGE, "a binary message")),
+                        Some(Ok(Frame::Ping(_) | Frame::Pong(_))) => Ok(()),
+                        Some(Ok(Frame::Close(_)) | Err(_)) | None => return None,
+                    }
+                }
+                message = self.messages.recv() => match message {
+                    Some(Message::Image(bytes)) => socket.send(Frame::Binary(bytes)).await,
+                    Some(Message::Pixel(answer)) => send(socket, &Answer::Pixel(answer)).await,
+                    Some(Message::Problem(message)) => send(socket, &Answer::Problem { message }).await,
+                    None => return None,
+                },
+                _ = status.tick() => {
+                    let rig = Arc::clone(&rig);
+                    match tokio::task::spawn_blocking(move || rig.status()).await {
+                        Ok(status) => send(socket, &Answer::Status(&status)).await,
+                        Err(_) => return None,
+                    }
+                }
+                _ = ping.tick() => {
+                    if heard.elapsed() > SILENCE {
+                        return None;
+                    }
+                    socket.send(Frame::Ping(axum::body::Bytes::new())).await
+                }
+            };
+            if sent.is_err() {
+                return None;
+            }
+        }
+    }
+
+    /// Does what the client asks for; a message about something that could not be done.
+    fn take(&self, text: &str) -> Result<Option<String>, End> {
+        match serde_json::from_str(text) {
+            // On the socket none is needed, and one more does no harm.
+            Ok(Request::Token(_)) => Ok(None),
+            Ok(Request::Watch(wanted)) => Ok(self.place.watch(&wanted).err().map(|e| e.to_string())),
+            Ok(Request::Credit(images)) => {
+                self.place.credit(images);
+                Ok(None)
+            }
+            Ok(Request::Pixel(question)) => {
+                self.place.ask(question);
+                Ok(None)
+            }
+            Err(e) => Err(End::new(code::BAD_MESSAGE, e.to_string())),
+        }
+    }
+}
+
+async fn send(socket: &mut WebSocket, answer: &Answer<'_>) -> Result<(), axum::Error> {
+    let text = serde_json::to_string(answer).map_err(axum::Error::new)?;
+    socket.send(Frame::Text(text.into())).await
+}

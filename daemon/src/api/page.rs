@@ -1,0 +1,135 @@
+//! The live page: where it is, and its files, which are part of the binary.
+
+use axum::http::{HeaderName, HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use axum::routing::MethodRouter;
+use serde::{Deserialize, Serialize};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::path::{Path, PathBuf};
+
+/// Nothing from elsewhere, no script or style in the markup, no markup from text.
+const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self'; base-uri 'none'; \
+     form-action 'none'; frame-ancestors 'none'; require-trusted-types-for 'script'";
+
+/// A file of the page.
+pub(super) struct File {
+    name: &'static str,
+    bytes: &'static [u8],
+}
+
+macro_rules! files {
+    ($($name:literal)*) => {
+        [$(File { name: $name, bytes: include_bytes!(concat!("../../page/", $name)) }),*]
+    };
+}
+
+/// The files in the folder `page`.
+pub(super) static FILES: [File; 30] = files![
+    "api.js" "blend.js" "colormap.js" "connection.js" "dom.js" "fit.js" "hover.js" "icon.svg"
+    "index.html" "keys.js" "labels.js" "layout.js" "main.js" "painter.js" "protocol.js" "range.js"
+    "recordbar.js" "recording.js" "recordtext.js" "replaybar.js" "scenes.js" "slot.js" "sound.js"
+    "style.css" "tile.js" "tilestate.js" "types.js" "wall.js" "watch.js" "words.js"
+];
+
+/// The WebSocket of the live page.
+pub(super) const LIVE: &str = "/v1/live";
+
+/// Where the live page is.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct PageAddress {
+    /// Its address without the token; `None` without a port.
+    pub url: Option<String>,
+    /// The file with the token, which the user that runs the rig can read.
+    pub token_file: Option<PathBuf>,
+}
+
+impl PageAddress {
+    pub(super) fn of(tcp: Option<SocketAddr>, token: Option<&Path>) -> Self {
+        let url = tcp.map(|tcp| {
+            // A page of another name has another origin, and another place for its token.
+            if tcp.ip() == IpAddr::V4(Ipv4Addr::LOCALHOST) {
+                format!("http://localhost:{}/", tcp.port())
+            } else {
+                format!("http://{tcp}/")
+            }
+        });
+        Self { url, token_file: token.map(Path::to_owned) }
+    }
+}
+
+/// Whether a port serves this path without a token: the page has no secret.
+pub(super) fn is_page(path: &str) -> bool {
+    FILES.iter().any(|f| f.path() == path)
+}
+
+impl File {
+    /// Where it is served.
+    pub(super) fn path(&self) -> String {
+        if self.name == "index.html" { "/".to_owned() } else { format!("/{}", self.name) }
+    }
+
+    fn content_type(&self) -> &'static str {
+        match self.name.rsplit_once('.') {
+            Some((_, "html")) => "text/html; charset=utf-8",
+            Some((_, "css")) => "text/css; charset=utf-8",
+            Some((_, "js")) => "text/javascript; charset=utf-8",
+            Some((_, "svg")) => "image/svg+xml",
+            _ => "application/octet-stream",
+        }
+    }
+
+    /// Serves it.
+    pub(super) fn handler<S: Clone + Send + Sync + 'static>(&'static self) -> MethodRouter<S> {
+        axum::routing::get(async move |headers: axum::http::HeaderMap| {
+            self.answer(headers.get(header::IF_NONE_MATCH))
+        })
+    }
+
+    fn answer(&self, known: Option<&HeaderValue>) -> Response {
+        let tag = format!("\"{:08x}\"", crc32fast::hash(self.bytes));
+        let same = known.is_some_and(|k| k.as_bytes() == tag.as_bytes());
+        let fixed: [(HeaderName, &'static str); 5] = [
+            (header::CONTENT_TYPE, self.content_type()),
+            (header::CONTENT_SECURITY_POLICY, POLICY),
+            (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
+            (header::REFERRER_POLICY, "no-referrer"),
+            (header::CACHE_CONTROL, "no-cache"),
+        ];
+        let tag = [(header::ETAG, tag)];
+        if same {
+            return (StatusCode::NOT_MODIFIED, fixed, tag).into_response();
+        }
+        (fixed, tag, self.bytes).into_response()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_table_is_the_folder() {
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/page");
+        let mut on_disk: Vec<String> = std::fs::read_dir(folder)
+            .unwrap()
+            .map(|e| e.unwrap().file_name().into_string().unwrap())
+            .collect();
+        on_disk.sort();
+        assert_eq!(on_disk, FILES.iter().map(|f| f.name).collect::<Vec<_>>(), "in the order of their names");
+        for file in &FILES {
+            assert_ne!(file.content_type(), "application/octet-stream", "{}", file.name);
+        }
+        let bytes: usize = FILES.iter().map(|f| f.bytes.len()).sum();
+        assert!(bytes < 300 << 10, "the page has {bytes} bytes");
+    }
+
+    #[test]
+    fn a_known_file_is_not_sent_again() {
+        let file = FILES.iter().find(|f| f.path() == "/").unwrap();
+        let first = file.answer(None);
+        assert_eq!(first.status(), StatusCode::OK);
+        let tag = first.headers()[header::ETAG].clone();
+        assert_eq!(file.answer(Some(&tag)).status(), StatusCode::NOT_MODIFIED);
+        assert!(first.headers().contains_key(header::CONTENT_SECURITY_POLICY));
+    }
+}

@@ -1,0 +1,250 @@
+//! The thread that encodes.
+
+use super::{Head, Message, Shared, State, pixel};
+use crate::priority;
+use core::time::Duration;
+use depthrig_bus::sync::lock;
+use depthrig_bus::{Bus, Frame, HostTime, StreamId, Subscriber};
+use depthrig_recorder::preview::{Preview, preview};
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::PoisonError;
+use tokio::sync::mpsc::error::TrySendError;
+
+/// How often a stream is looked at while somebody waits for its next frame.
+const POLL: Duration = Duration::from_millis(5);
+/// How often a stream that does not exist yet is looked for.
+const RETRY: Duration = Duration::from_millis(500);
+/// How long the thread waits for viewers that have no credit before it looks again.
+const IDLE: Duration = Duration::from_secs(1);
+
+/// Runs until nobody watches any stream.
+pub(super) fn run(shared: &Shared) {
+    priority::lower_current_thread();
+    match Bus::open(&shared.runtime, &shared.rig) {
+        Ok(bus) => Worker::new(bus).run(shared),
+        Err(e) => {
+            let mut state = lock(&shared.state);
+            for viewer in state.viewers.values() {
+                let _ = viewer.to.try_send(Message::Problem(e.to_string()));
+            }
+            state.is_running = false;
+        }
+    }
+}
+
+struct Worker {
+    bus: Bus,
+    streams: BTreeMap<StreamId, Source>,
+    /// The newest frame of each stream.
+    frames: BTreeMap<StreamId, Frame>,
+    /// The images encoded last, for viewers that come a little later.
+    encoded: BTreeMap<Size, Encoded>,
+}
+
+/// A stream at a width.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+struct Size {
+    id: StreamId,
+    width: u32,
+}
+
+struct Encoded {
+    /// Of the frame.
+    sequence: u64,
+    /// `None` if it could not be encoded.
+    image: Option<Preview>,
+}
+
+/// A watched stream.
+enum Source {
+    Open(Box<Subscriber>),
+    /// It does not exist; when to look again.
+    Missing(HostTime),
+}
+
+/// An image that is to be sent.
+struct Job {
+    viewer: u64,
+    /// In the viewer's list.
+    index: usize,
+    id: StreamId,
+    width: u32,
+    due: HostTime,
+}
+
+impl Worker {
+    const fn new(bus: Bus) -> Self {
+        Self { bus, streams: BTreeMap::new(), frames: BTreeMap::new(), encoded: BTreeMap::new() }
+    }
+
+    fn run(mut self, shared: &Shared) {
+        loop {
+            let watched: BTreeSet<StreamId> = {
+                let mut state = lock(&shared.state);
+                let all =
+                    state.viewers.values().flat_map(|v| v.watched.iter().map(|w| w.id.clone())).collect();
+                if BTreeSet::is_empty(&all) {
+                    state.is_running = false;
+                    return;
+                }
+                all
+            };
+            self.streams.retain(|id, _| watched.contains(id));
+            self.frames.retain(|id, _| watched.contains(id));
+            self.encoded.retain(|size, _| watched.contains(&size.id));
+            for id in watched {
+                self.take_newest(id, shared);
+            }
+            self.answer(shared);
+            let jobs = self.due(&lock(&shared.state));
+            let has_work = !jobs.is_empty();
+            self.send(jobs, shared);
+            let state = lock(&shared.state);
+            let pause = if has_work { Duration::ZERO } else { pause(&state) };
+            if !pause.is_zero() {
+                drop(shared.changed.wait_timeout(state, pause).unwrap_or_else(PoisonError::into_inner));
+            }
+        }
+    }
+
+    /// Takes the newest frame of a stream.
+    fn take_newest(&mut self, id: StreamId, shared: &Shared) {
+        let source = self.streams.entry(id.clone()).or_insert_with(|| Source::Missing(HostTime::now()));
+        if let Source::Missing(again) = source
+            && again.from_now().is_zero()
+        {
+            match self.bus.subscriber(&id) {
+                Ok(subscriber) => *source = Source::Open(Box::new(subscriber)),
+                Err(e) => {
+                    *source = Source::Missing(HostTime::now().plus(RETRY));
+                    // A camera that is being opened has no channel yet; its state says so.
+                    if e.kind() != depthrig_bus::ErrorKind::NotFound {
+                        tell(shared, &id, &e);
+                    }
+                }
+            }
+        }
+        let Source::Open(subscriber) = source else { return };
+        match subscriber.latest() {
+            Ok(Some(frame)) => drop(self.frames.insert(id, frame)),
+            Ok(None) => {}
+            Err(e) => {
+                // Its publisher may have begun anew.
+                *source = Source::Missing(HostTime::now().plus(RETRY));
+                tell(shared, &id, &e);
+            }
+        }
+    }
+
+    fn answer(&self, shared: &Shared) {
+        let mut state = lock(&shared.state);
+        let questions: Vec<_> =
+            state.viewers.iter_mut().flat_map(|(n, v)| v.questions.drain(..).map(|q| (*n, q))).collect();
+        drop(state);
+        for (viewer, question) in questions {
+            let answer = pixel::answer(question, &self.frames);
+            if let Some(viewer) = lock(&shared.state).viewers.get(&viewer) {
+                // One that does not read gets no answer.
+                let _ = viewer.to.try_send(Message::Pixel(answer));
+            }
+        }
+    }
+
+    /// Images that are due and new, of viewers with credit, those that have waited longest first.
+    fn due(&self, state: &State) -> Vec<Job> {
+        let now = HostTime::now();
+        let mut jobs = Vec::new();
+        for (number, viewer) in state.viewers.iter().filter(|(_, v)| v.credits > 0) {
+            for (index, watched) in viewer.watched.iter().enumerate() {
+                let newest = self.frames.get(&watched.id).map(|f| f.header().sequence);
+                if watched.due <= now && newest.is_some() && newest != watched.sent {
+                    let id = watched.id.clone();
+                    jobs.push(Job { viewer: *number, index, id, width: watched.width, due: watched.due });
+                }
+            }
+        }
+        jobs.sort_by_key(|job| job.due);
+        jobs
+    }
+
+    fn send(&mut self, jobs: Vec<Job>, shared: &Shared) {
+        for job in jobs {
+            // Without credit it is not encoded.
+            if lock(&shared.state).viewers.get(&job.viewer).is_none_or(|v| v.credits == 0) {
+                continue;
+            }
+            let Some(frame) = self.frames.get(&job.id) else { continue };
+            let header = frame.header();
+            let size = Size { id: job.id.clone(), width: job.width };
+            if self.encoded.get(&size).is_none_or(|e| e.sequence != header.sequence) {
+                let made = preview(header, frame.pixels(), job.width);
+                let image = made.map_err(|e| tell(shared, &job.id, &e)).ok();
+                self.encoded.insert(size.clone(), Encoded { sequence: header.sequence, image });
+            }
+            let image = self.encoded.get(&size).and_then(|e| e.image.as_ref());
+            let mut state = lock(&shared.state);
+            let Some(viewer) = state.viewers.get_mut(&job.viewer) else { continue };
+            let generation = viewer.generation;
+            let Some(watched) = viewer.watched.get_mut(job.index).filter(|w| w.id == job.id) else {
+                continue;
+            };
+            watched.sent = Some(header.sequence);
+            watched.due = next_turn(&watched.id, watched.period);
+            let Some(image) = image else { continue };
+            let head = Head {
+                kind: image.kind,
+                index: job.index as u16,
+                step: image.step,
+                width: image.width,
+                height: image.height,
+                full_width: header.width as u16,
+                full_height: header.height as u16,
+                sequence: header.sequence,
+                capture_time_ns: header.capture_time_ns,
+                age_ns: HostTime::now().ns() - header.capture_time_ns,
+                depth_unit_m: image.depth_unit_m,
+                generation,
+            };
+            match viewer.to.try_send(Message::Image(head.message(&image.bytes))) {
+                Ok(()) => viewer.credits -= 1,
+                // It does not read, or has gone.
+                Err(TrySendError::Full(_) | TrySendError::Closed(_)) => {}
+            }
+        }
+    }
+}
+
+/// Until the next image is due, or a frame may have come for one that is.
+fn pause(state: &State) -> Duration {
+    let mut pause = IDLE;
+    for viewer in state.viewers.values() {
+        if !viewer.questions.is_empty() {
+            return Duration::ZERO;
+        }
+        if viewer.credits > 0 {
+            for watched in &viewer.watched {
+                pause = pause.min(watched.due.from_now().max(POLL));
+            }
+        }
+    }
+    pause
+}
+
+/// The next time at which a stream is sent with this period. It is the same for all viewers, so that an image is encoded once for all, and
+/// another one for each stream, so that not all are encoded at once.
+fn next_turn(id: &StreamId, period: Duration) -> HostTime {
+    let period = period.as_nanos() as i64;
+    let phase = i64::from(crc32fast::hash(id.to_string().as_bytes())) % period;
+    let now = HostTime::now().ns();
+    let into = (now - phase).rem_euclid(period);
+    HostTime::from_ns(now - into + period)
+}
+
+/// Says to all who watch a stream why it is not shown.
+fn tell(shared: &Shared, id: &StreamId, why: &impl core::fmt::Display) {
+    for viewer in lock(&shared.state).viewers.values() {
+        if viewer.watched.iter().any(|w| w.id == *id) {
+            let _ = viewer.to.try_send(Message::Problem(format!("{id}: {why}")));
+        }
+    }
+}
