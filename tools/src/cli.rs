@@ -3,7 +3,7 @@
 use crate::args::Global;
 use crate::commands::{
     bench, calibrate, cameras, cat, cdm, cloud, compare, completions, config, demo, doctor, edit, eval,
-    export, import, info, install, man, merge, record, recover, replay, report, run, sessions, status,
+    export, import, info, install, man, merge, open, record, recover, replay, report, run, sessions, status,
     stereo, tap, top, trim, verify, zed,
 };
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
@@ -61,6 +61,9 @@ pub enum Command {
     /// Show cameras, rates, losses, clocks, recording and disk of the running daemon
     #[command(after_help = status::EXAMPLES)]
     Status(status::StatusArgs),
+    /// Open the live page of the running daemon in a browser
+    #[command(after_help = open::EXAMPLES)]
+    Open(open::OpenArgs),
     /// Watch the running daemon, refreshed in place; q or Ctrl-C quits
     Top(top::TopArgs),
     /// Replay datasets on the live channels, and control a running replay

@@ -19,6 +19,7 @@ pub mod info;
 pub mod install;
 pub mod man;
 pub mod merge;
+pub mod open;
 pub mod record;
 pub mod recover;
 pub mod replay;
@@ -50,6 +51,7 @@ pub fn run(cli: Cli) -> Result<Exit> {
         Command::Run(args) => run::run(&args, &context),
         Command::Record(command) => record::run(&command, &context),
         Command::Status(args) => status::run(&args, &context),
+        Command::Open(args) => open::run(&args, &context),
         Command::Top(args) => top::run(&args, &context),
         Command::Replay(args) => replay::run(&args, &context),
         Command::Info(args) => info::run(&args),

@@ -47,6 +47,7 @@ fn every_command_has_help_that_fits_and_an_entry_in_the_manual() {
         "compare",
         "trim",
         "merge",
+        "open",
         "config",
         "install",
         "calibrate",
