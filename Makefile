@@ -20,7 +20,7 @@ FEED := .venv-feed
 OAK := .venv-oak
 # Robots' meshes and a ray tracer, for the alignment of cameras with a robot's arm.
 ROBOTS := .venv-robots
-REQUIREMENTS := python/requirements-test.txt $(READERS)/requirements.txt
+REQUIREMENTS := python/requirements-test.txt $(READERS)/requirements.txt tests/page_browser/requirements.txt
 
 .PHONY: help demo demo-calibration environments test check-debian13 test-long vm fuzz lint bench bench-peers bench-feed clean setup-build setup-test setup-vm setup-peers setup-fuzz
 

@@ -60,6 +60,8 @@ for part in "$@"; do
         need g++ command -v c++
         # Inspects the dependencies of a program.
         need binutils command -v objdump
+        # The browser that the live page is tested in.
+        need chromium command -v chromium
         # The boxes that tests run in.
         need util-linux command -v setpriv
         ;;

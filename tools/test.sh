@@ -133,6 +133,7 @@ step rust-small "$runner" "$built" "${small[@]}" --nofile 64 --only depthrig-bus
 step rust-busy "$runner" "$built" "${small[@]}" --nofile 256 --only depthrig-tests:dataset --only depthrig-tests:replay
 
 step daemon box -- "${tests[@]}" tests/python
+step page box -- node --test tests/page/
 
 # Third-party readers must find the same pixels.
 work=$home/t/readers
