@@ -3,7 +3,7 @@
 const TOKEN_KEY = "depthrig-token";
 const TIMEOUT_MS = 8000;
 
-/** An answer of the API that is no success. */
+/** An error that the API answers with. */
 export class ApiError extends Error {
   /**
    * @param {string} kind
@@ -69,7 +69,7 @@ export async function post(path, body = {}, timeoutMs = TIMEOUT_MS) {
   try {
     answer = text === "" ? null : JSON.parse(text);
   } catch {
-    // An answer that is no JSON comes from something else on this port; the code says enough.
+    // An answer that is not JSON comes from something else on this port; the code says enough.
   }
   if (!response.ok) {
     throw errorOf(answer, response.status);

@@ -9,10 +9,8 @@ import http.client
 import os
 import re
 import signal
-import subprocess
 import tomllib
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -37,7 +35,7 @@ from page import (
     until,
 )
 from playwright.sync_api import Browser, sync_playwright
-from test_daemon import ROOT, WAIT_S, binary, command, environment, runtime
+from test_daemon import ROOT, WAIT_S, binary, command, running, runtime
 
 __all__ = ["binary", "runtime"]
 
@@ -75,22 +73,8 @@ duration_s = 3600.0
 """
 
 
-@contextmanager
-def served(binary: str, runtime: Path, log: Path, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
-    """A daemon that may lose frames: a browser beside it takes all of a small computer."""
-    with log.open("ab") as out:
-        process = subprocess.Popen([binary, *arguments], env=environment(runtime), stdout=out, stderr=out)
-    try:
-        yield process
-        if process.poll() is None:
-            process.send_signal(signal.SIGINT)
-        assert process.wait(WAIT_S) in (0, 3, -signal.SIGKILL)
-    except BaseException:
-        print(log.read_text(errors="replace"))
-        raise
-    finally:
-        process.kill()
-        process.wait()
+CODES = (0, 3, -signal.SIGKILL)
+"""A daemon may lose frames: a browser beside it takes all of a small computer. One is killed."""
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +103,7 @@ def dataset(binary: str, runtime: Path, folder: Path) -> Path:
     rig.write_text(text + files_camera("still", folder / "still" / "camera.toml"))
     out = folder / "short"
     arguments = ("run", str(rig), "--record", str(out), "--seconds", "3")
-    with served(binary, runtime, folder / "short.log", *arguments) as daemon:
+    with running(binary, runtime, folder / "short.log", *arguments, codes=CODES) as daemon:
         daemon.wait(WAIT_S)
     (found,) = out.iterdir()
     return found
@@ -128,7 +112,7 @@ def dataset(binary: str, runtime: Path, folder: Path) -> Path:
 @pytest.fixture(scope="module")
 def rig(binary: str, runtime: Path, folder: Path, dataset: Path) -> Iterator[Address]:
     """The rig of which most tests look at the page; `dataset` is made first so that they do not disturb each other."""
-    with served(binary, runtime, folder / "wall.log", "run", str(folder / "wall.toml")):
+    with running(binary, runtime, folder / "wall.log", "run", str(folder / "wall.toml"), codes=CODES):
         yield address(binary, runtime, "wall")
 
 
@@ -449,7 +433,7 @@ def test_a_lost_camera_says_why_and_a_lost_daemon_is_found_again(
     text = RIG.format(name="away", port=free_port())
     rig.write_text(text + files_camera("still", folder / "still" / "camera.toml") + AWAY + PULLED)
     log = folder / "away.log"
-    with served(binary, runtime, log, "run", str(rig)) as daemon, blank(browser, "") as wall:
+    with running(binary, runtime, log, "run", str(rig), codes=CODES) as daemon, blank(browser, "") as wall:
         first = address(binary, runtime, "away")
         wall.open(first.text)
         wall.wait_for_image("still/color")
@@ -463,7 +447,7 @@ def test_a_lost_camera_says_why_and_a_lost_daemon_is_found_again(
         daemon.kill()
         wall.wait_for_state("#connection", "lost")
         wall.wait_for("() => document.querySelectorAll('section.tile[data-state=\"live\"]').length === 0")
-        with served(binary, runtime, log, "run", str(rig)):
+        with running(binary, runtime, log, "run", str(rig), codes=CODES):
             # Its token is another one, and the page says how to get it.
             wall.wait_for_state("#connection", "denied")
             assert "depthrig open" in wall.page.inner_text("body")
@@ -475,7 +459,7 @@ def test_a_lost_camera_says_why_and_a_lost_daemon_is_found_again(
 
 
 def test_a_replay_is_scrubbed(browser: Browser, binary: str, runtime: Path, folder: Path, dataset: Path) -> None:
-    with served(binary, runtime, folder / "replay.log", "replay", str(dataset), "--rig", "again", "--loop"):
+    with running(binary, runtime, folder / "replay.log", "replay", str(dataset), "--rig", "again", "--loop", codes=CODES):
         where = address(binary, runtime, "again")
         with opened(browser, where) as wall:
             wall.wait_for_image("still/color", "still/depth")

@@ -10,11 +10,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::PoisonError;
 use tokio::sync::mpsc::error::TrySendError;
 
-/// How often a stream is looked at while somebody waits for its next frame.
+/// Pause between two looks at a stream whose next frame somebody waits for.
 const POLL: Duration = Duration::from_millis(5);
-/// How often a stream that does not exist yet is looked for.
+/// Pause before a stream that does not exist is looked for again.
 const RETRY: Duration = Duration::from_millis(500);
-/// How long the thread waits for viewers that have no credit before it looks again.
+/// The longest wait, when no viewer has credit.
 const IDLE: Duration = Duration::from_secs(1);
 
 /// Runs until nobody watches any stream.
