@@ -20,7 +20,9 @@ mod guard;
 mod limits;
 mod live;
 mod page;
+mod recordings;
 mod reply;
+mod requests;
 mod routes;
 mod serve;
 mod socket;
@@ -28,10 +30,10 @@ mod token;
 
 pub use events::{CaptureEvent, MAX_FOLLOWERS};
 pub use page::PageAddress;
+pub use recordings::{MarkRequest, NameRequest, Recording, Recordings, ReportPage};
 pub(crate) use reply::{ErrorBody, kind_of_name};
-pub use routes::{
-    Health, HealthReason, LoopRequest, NoteRequest, OPENAPI, ROUTES, RateRequest, Route, StepRequest,
-};
+pub use requests::{CameraRequest, FingerprintRequest, LoopRequest, NoteRequest, RateRequest, StepRequest};
+pub use routes::{Health, HealthReason, OPENAPI, ROUTES, Route};
 pub use serve::ServerHandle;
 
 use crate::Result;

@@ -20,6 +20,7 @@ mod recording;
 pub mod replay;
 pub mod rig;
 pub mod sets;
+mod showing;
 mod sink;
 pub mod stage;
 pub mod status;
@@ -28,3 +29,4 @@ mod viewers;
 mod wake;
 
 pub use error::{Error, ErrorKind, Result};
+pub use showing::Showing;

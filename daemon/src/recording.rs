@@ -148,9 +148,9 @@ impl Begun {
         budget::check(&*outside.fs, &path, request, rate, reserve, &config.recording)?;
         let fs = Arc::clone(&outside.fs);
         let clock = Arc::clone(&outside.utc);
-        let recorder = Recorder::create_with(fs, clock, &path, session, options).map_err(of_recorder)?;
+        let recorder = Recorder::create_with(fs, clock, &path, session, options).map_err(Error::from)?;
         if !request.notes.is_empty() {
-            recorder.add_note(request.notes.as_str()).map_err(of_recorder)?;
+            recorder.add_note(request.notes.as_str()).map_err(Error::from)?;
         }
         tracing::info!(path = %path.display(), streams = streams.len(), imus = units.len(), "recording");
         let status = RecordingStatus {
@@ -272,7 +272,7 @@ impl Recording {
         if text.trim().is_empty() {
             return Err(Error::new(ErrorKind::BadInput, "the note is empty"));
         }
-        active.recorder.add_note(text).map_err(of_recorder)
+        active.recorder.add_note(text).map_err(Error::from)
     }
 
     /// Takes the recorder out, to be finished without keeping others waiting.
@@ -284,6 +284,9 @@ impl Recording {
         let mut active = self.active.take().ok_or_else(none_active)?;
         self.motion.end(&mut active.motion);
         active.hand_over_accounts();
+        if let Some(last) = &mut self.last {
+            last.closing = true;
+        }
         Ok(Finishing { active })
     }
 
@@ -406,7 +409,7 @@ impl Finishing {
             Err(e) => {
                 status.error = Some(e.to_string());
                 tracing::error!(path = status.path, error = %e, "the recording could not be closed");
-                (status, Err(of_recorder(e)))
+                (status, Err(e.into()))
             }
         }
     }
@@ -448,17 +451,6 @@ fn finish(recording: &Mutex<Recording>, finishing: Finishing) -> Result<Recordin
 
 fn none_active() -> Error {
     Error::new(ErrorKind::WrongState, "no recording is going on; start one with: depthrig record start")
-}
-
-fn of_recorder(e: depthrig_recorder::Error) -> Error {
-    use depthrig_recorder::ErrorKind as Rec;
-    let kind = match e.kind() {
-        Rec::DiskFull => ErrorKind::NoSpace,
-        Rec::PermissionDenied => ErrorKind::PermissionDenied,
-        Rec::AlreadyExists | Rec::BadInput => ErrorKind::BadInput,
-        _ => ErrorKind::Other,
-    };
-    Error::new(kind, e.to_string()).with_source(e)
 }
 
 /// Bytes of its disk that a recording never uses.

@@ -161,6 +161,24 @@ fn every_answer_of_a_live_server_fits_the_document() {
     check("GET", "/v1/health", &served.get("/v1/health"), 200);
     check("GET", "/v1/config", &served.get("/v1/config"), 200);
     check("GET", "/metrics", &served.get("/metrics"), 200);
+    // This rig has neither cameras nor a folder; tests/python/test_live_rig.py has answers of one that does.
+    for path in ["/v1/recordings", "/v1/doctor", "/v1/controls", "/v1/controls/changes"] {
+        check("GET", path, &served.get(path), 409);
+    }
+    check("GET", "/v1/recordings/image", &served.get("/v1/recordings/image?name=x"), 409);
+    check("GET", "/v1/recordings/image", &served.get("/v1/recordings/image"), 400);
+    check("GET", "/v1/report/{ticket}", &served.get("/v1/report/0123"), 404);
+    for (path, body) in [
+        ("/v1/recordings/mark", r#"{"name": "x", "mark": "bad"}"#),
+        ("/v1/recordings/report", r#"{"name": "x"}"#),
+        ("/v1/controls", r#"{"camera": "x", "name": "gain", "value": 1}"#),
+        ("/v1/controls/revert", r#"{"camera": "x"}"#),
+        ("/v1/controls/save", r#"{"fingerprint": "x"}"#),
+    ] {
+        check("POST", path, &served.post(path, body), 409);
+        check("POST", path, &served.post(path, r#"{"unknown": 1}"#), 400);
+    }
+    check("POST", "/v1/record/stop", &served.post("/v1/record/stop", r#"{"mark": "ugly"}"#), 400);
     check("GET", "/v1/page", &served.get("/v1/page"), 200);
     check("GET", "/v1/openapi.json", &served.get("/v1/openapi.json"), 200);
     for (kind, wanted) in [

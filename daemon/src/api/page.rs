@@ -31,6 +31,8 @@ pub(super) static FILES: [File; 30] = files![
     "style.css" "tile.js" "tilestate.js" "types.js" "wall.js" "watch.js" "words.js"
 ];
 
+/// Where reports are, each below an address of its own: a tab that is opened cannot send the token.
+pub(super) const REPORT: &str = "/v1/report/";
 /// The WebSocket of the live page.
 pub(super) const LIVE: &str = "/v1/live";
 

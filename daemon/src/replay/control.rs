@@ -202,6 +202,7 @@ impl Control for Inner {
                 spread_p95_ms: ms(0.95),
                 spread_p99_ms: ms(0.99),
                 spread_max_ms: spreads.max_ns() as f64 / 1e6,
+                skews: Vec::new(),
             },
             recording,
             shared_memory: SharedMemoryStatus {

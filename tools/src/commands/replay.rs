@@ -203,6 +203,7 @@ const LINGER: Duration = Duration::from_millis(300);
 fn replay(args: &StartArgs, context: &Context) -> Result<Exit> {
     let stop = Stop::on_signals()?;
     let options = ReplayOptions {
+        in_background: false,
         rate: args.rate,
         looped: args.looped,
         from_s: args.from,

@@ -10,8 +10,9 @@ use core::sync::atomic::{AtomicBool, Ordering};
 use core::time::Duration;
 use depthrig_bus::sync::lock;
 use depthrig_bus::{HostTime, RuntimeDir};
+use depthrig_daemon::Showing;
 use depthrig_daemon::config::RigConfig;
-use depthrig_daemon::control::{Control, RecordRequest};
+use depthrig_daemon::control::{Control, RecordRequest, Shows};
 use depthrig_daemon::rig::{Rig, RigOptions, RigSummary};
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
@@ -139,8 +140,10 @@ pub fn start(
         shown.0.set(&what, done as u64, total as u64);
         shown.1 = HostTime::now();
     };
+    let shows = serve_api.then(|| Showing::new(&runtime, &config.rig)).transpose()?;
     let options = RigOptions {
         serve_api,
+        shows: shows.map(|shows| Arc::new(shows) as Arc<dyn Shows>),
         cache_dir,
         progress: Some(Box::new(progress)),
         // With an API, subscribers can query the rendering progress, so streaming starts at once.
