@@ -2,6 +2,7 @@
 
 import { takeToken } from "./api.js";
 import { Blend } from "./blend.js";
+import { CloudView } from "./cloudview.js";
 import { Connection } from "./connection.js";
 import { announce, byId, releaseFocusAfterClicks, setState, setText } from "./dom.js";
 import { Hover } from "./hover.js";
@@ -32,7 +33,10 @@ Object.assign(window, { depthrig: debug });
 /** @type {Status | null} */
 let status = null;
 
-const range = new DepthRange(() => wall.redrawAll((tile) => tile.isDepth || tile === wall.enlarged));
+const range = new DepthRange(() => {
+  wall.redrawAll((tile) => tile.isDepth || tile === wall.enlarged);
+  cloud.redraw();
+});
 const blend = new Blend(() => {
   wall.redrawAll((tile) => tile === wall.enlarged);
   wall.askWatch();
@@ -54,7 +58,22 @@ const wall = new Wall({
     }
     labels.drawn(tile, ageMs);
   },
+  watchInstead: () => cloud.watch(),
+  takeInstead: (stream, delivery) => cloud.accept(stream, delivery),
 });
+const cloud = new CloudView({
+  askWatch: () => wall.askWatch(),
+  range: () => range.current,
+  replay: () => ({
+    isPaused: replayBar.isShown && replayBar.isWaiting,
+    fastestHz: replayBar.isShown ? replayBar.fastestHz : Infinity,
+  }),
+  onToggled: (isOpen) => {
+    byId("wall", HTMLElement).hidden = isOpen;
+    hover.hide();
+  },
+});
+Object.assign(debug, { view: cloud.facts });
 const labels = new TileLabels(wall);
 const hover = new Hover(wall.tiles, (id, place) => connection.askPixel(id, place));
 const recordBar = new RecordBar();
@@ -66,6 +85,8 @@ const connection = new Connection({
   onStatus: showStatus,
   onImage: (image, credit) => wall.accept(image, credit),
   onPixel: (answer) => hover.answer(answer),
+  onGeometry: (geometry) => cloud.place(geometry),
+  onMeasure: () => {},
   onProblem: showProblem,
 });
 
@@ -107,6 +128,7 @@ function showStatus(next) {
   soundForCameras(next);
   status = next;
   wall.build(next.cameras);
+  cloud.update(next);
   for (const camera of next.cameras) {
     for (const stream of camera.streams) {
       const tile = wall.tiles.get(stream.id);
@@ -155,7 +177,8 @@ function showTiles() {
   if (document.hidden || status === null) {
     return;
   }
-  range.follow(wall.tiles.values(), now);
+  range.follow(cloud.isOpen ? cloud.sources : wall.tiles.values(), now);
+  cloud.tick(now);
   const facts = {
     cameras: status.cameras,
     isLive: connection.isLive,
@@ -175,10 +198,15 @@ function act(action) {
     case "note":
       return recordBar.focusNotes();
     case "back":
-      return wall.enlarge(null);
+      return cloud.isOpen ? cloud.close() : wall.enlarge(null);
     case "help":
       return byId("help", HTMLDialogElement).showModal();
+    case "cloud":
+      return cloud.toggle();
+    case "aids":
+      return undefined;
     case "camera":
+      cloud.close();
       return wall.enlargeCamera(action.n);
     case "enlarge": {
       const focused = document.activeElement;

@@ -1,0 +1,481 @@
+/** The 3-D view: the fused points of all cameras, shown instead of the wall. */
+
+import { CloudRenderer, poseOf } from "./cloudgl.js";
+import { CloudInput } from "./cloudinput.js";
+import { CloudLabels } from "./cloudlabels.js";
+import { AXES, floorLines, frustumLines, quantile, upOf } from "./cloudscene.js";
+import { CloudSource, TINTS, sourcesOf } from "./cloudsource.js";
+import { announce, byId, make, setText } from "./dom.js";
+import { dot, multiply } from "./matrix.js";
+import { home, projectionMatrix, viewMatrix } from "./orbit.js";
+import { SMALL_WIDTH, Thinning, cloudWidth } from "./thinning.js";
+import { isDepthFormat } from "./tile.js";
+import { periodMs } from "./tilestate.js";
+
+/** @typedef {import("./types.js").Status} Status */
+/** @typedef {import("./types.js").Geometry} Geometry */
+/** @typedef {import("./types.js").Watch} Watch */
+/** @typedef {import("./orbit.js").Orbit} Orbit */
+/** @typedef {import("./cloudgl.js").Paint} Paint */
+
+const FEW_CAMERAS = 4;
+const FEW_HZ = 10;
+const MANY_HZ = 5;
+const SAMPLES = 400;
+/** The view is placed once every camera has an image, or when it is clear that one of them has none. */
+const HOME_WAIT_MS = 1500;
+const DEPTH_UNKNOWN_M = 1.5;
+const FRUSTUM_SHARE = 0.16;
+const MOST_PIXEL_RATIO = 2;
+
+const NO_WEBGL =
+  "This browser gives the page no WebGL2, which the 3-D view needs. In Chrome or Chromium, switch on “Use graphics " +
+  "acceleration when available” in the settings, or start it with --enable-unsafe-swiftshader. The wall works without.";
+const LOST = "The graphics driver took the 3-D view away; it comes back by itself. If it does not, close and open it again.";
+const SAME_POSES =
+  "All cameras have the same pose, so that their points lie within each other. “depthrig calibrate” finds the poses.";
+
+/**
+ * @typedef {Object} CloudOptions
+ * @property {() => void} askWatch
+ * @property {() => {range: import("./colormap.js").Range, isAutomatic: boolean}} range
+ * @property {() => {isPaused: boolean, fastestHz: number}} replay
+ * @property {(isOpen: boolean) => void} onToggled
+ */
+
+export class CloudView {
+  isOpen = false;
+  #section = byId("cloud", HTMLElement);
+  #box = byId("cloud-box", HTMLElement);
+  #canvas = byId("cloud-canvas", HTMLCanvasElement);
+  #cameras = byId("cloud-cameras", HTMLElement);
+  #message = byId("cloud-message", HTMLElement);
+  #facts = byId("cloud-facts", HTMLElement);
+  #paint = byId("cloud-paint", HTMLSelectElement);
+  #limit = byId("cloud-points", HTMLSelectElement);
+  #up = byId("cloud-up", HTMLSelectElement);
+  #button = byId("show-cloud", HTMLButtonElement);
+  #labels = new CloudLabels(byId("cloud-labels", HTMLElement));
+  #thinning = new Thinning();
+  /** @type {CloudRenderer | null} */
+  #renderer = null;
+  #hasNoWebgl = false;
+  #isLost = false;
+  /** @type {Map<string, Geometry>} by stream, since the page was opened */
+  #geometries = new Map();
+  /** @type {CloudSource[]} */
+  #sources = [];
+  #built = "";
+  /** @type {Status | null} */
+  #status = null;
+  /** @type {Orbit} */
+  #orbit = { target: [0, 0, 1], up: [0, -1, 0], distance: 2, yaw: 0, pitch: 0.4 };
+  #floor = 1;
+  #isHomeDue = true;
+  #openedAt = 0;
+  #isDirty = false;
+  #isFrameAsked = false;
+  /** @type {{at: number, points: number} | null} the frame that is drawn */
+  #drawing = null;
+  #ms = 0;
+  #options;
+
+  /** For tests and for a look from the console. */
+  facts = {
+    isOpen: false,
+    /** @type {number[]} column by column */
+    viewProjection: [],
+    width: 0,
+    height: 0,
+    points: 0,
+    offered: 0,
+    frames: 0,
+    ms: 0,
+    /** @type {string[]} */
+    stale: [],
+    /** @type {string[]} */
+    placed: [],
+  };
+
+  /** @param {CloudOptions} options */
+  constructor(options) {
+    this.#options = options;
+    new CloudInput(this.#canvas, {
+      orbit: () => this.#orbit,
+      move: (orbit) => {
+        this.#orbit = orbit;
+        this.#isHomeDue = false;
+        this.redraw();
+      },
+      reset: () => this.#reset(),
+      nextPaint: () => this.#nextPaint(),
+    });
+    this.#canvas.addEventListener("webglcontextlost", (event) => {
+      event.preventDefault();
+      this.#isLost = true;
+      this.#renderer = null;
+      this.#drawing = null;
+      this.#sources.forEach((source) => source.release(null));
+      this.#say();
+    });
+    this.#canvas.addEventListener("webglcontextrestored", () => {
+      this.#isLost = false;
+      this.#createRenderer();
+      this.redraw();
+    });
+    new ResizeObserver(() => this.redraw()).observe(this.#box);
+    document.addEventListener("visibilitychange", () => this.#sources.forEach((source) => source.clear()));
+    this.#button.addEventListener("click", () => this.toggle());
+    byId("cloud-close", HTMLButtonElement).addEventListener("click", () => this.close());
+    byId("cloud-reset", HTMLButtonElement).addEventListener("click", () => this.#reset());
+    this.#paint.addEventListener("change", () => this.redraw());
+    this.#up.addEventListener("change", () => this.#reset());
+    this.#limit.addEventListener("change", () => this.#limitChanged());
+  }
+
+  toggle() {
+    if (this.isOpen) {
+      this.close();
+    } else {
+      this.open();
+    }
+  }
+
+  open() {
+    this.#setOpen(true);
+    this.#openedAt = performance.now();
+    this.#createRenderer();
+    this.#canvas.focus({ preventScroll: true });
+    this.redraw();
+    announce("3-D view");
+  }
+
+  close() {
+    if (!this.isOpen) {
+      return;
+    }
+    this.#setOpen(false);
+    // Its memory on the graphics card is free for other programs; the context is kept for the next time.
+    this.#sources.forEach((source) => source.release(this.#renderer));
+    announce("All streams");
+  }
+
+  /** @param {boolean} isOpen */
+  #setOpen(isOpen) {
+    this.isOpen = isOpen;
+    this.facts.isOpen = isOpen;
+    this.#section.hidden = !isOpen;
+    this.#button.setAttribute("aria-pressed", String(isOpen));
+    this.#options.onToggled(isOpen);
+    this.#options.askWatch();
+  }
+
+  #createRenderer() {
+    if (this.#renderer !== null || this.#isLost) {
+      return;
+    }
+    const gl = this.#canvas.getContext("webgl2", { alpha: false, antialias: false });
+    this.#hasNoWebgl = gl === null;
+    this.#renderer = gl === null ? null : new CloudRenderer(gl);
+    this.#say();
+  }
+
+  /** @param {Status} status */
+  update(status) {
+    this.#status = status;
+    const streams = sourcesOf(status.cameras, isDepthFormat);
+    const built = JSON.stringify(streams);
+    if (built !== this.#built) {
+      this.#built = built;
+      this.#sources.forEach((source) => source.release(this.#renderer));
+      this.#sources = streams.map((stream, i) =>
+        new CloudSource(stream, TINTS[i % TINTS.length], this.#geometries, () => this.#prepared()));
+      for (const source of this.#sources) {
+        const first = this.#sources.find(({ camera }) => camera === source.camera);
+        source.isShown = source === first;
+      }
+      this.#offerCameras();
+      this.#options.askWatch();
+    }
+  }
+
+  /** @param {Geometry} geometry */
+  place(geometry) {
+    this.#geometries.set(geometry.stream, geometry);
+    if (this.isOpen) {
+      this.redraw();
+    }
+  }
+
+  /** The depth that the range of the colours follows. */
+  get sources() {
+    return this.isOpen ? this.#sources : [];
+  }
+
+  /**
+   * The streams that it needs; `null` while it is closed.
+   *
+   * @returns {Watch[] | null}
+   */
+  watch() {
+    if (!this.isOpen) {
+      return null;
+    }
+    if (this.#hasNoWebgl) {
+      return [];
+    }
+    const shown = this.#sources.filter(({ isShown }) => isShown);
+    const hz = shown.length <= FEW_CAMERAS ? FEW_HZ : MANY_HZ;
+    const width = cloudWidth(this.#limit.value === "auto" ? 0 : this.#thinning.limit, shown.length);
+    const colors = new Set(shown.flatMap(({ colorId }) => colorId ?? []));
+    return [
+      ...shown.map(({ id }) => ({ stream: id, width, rate_hz: hz })),
+      ...[...colors].map((stream) => ({ stream, width: SMALL_WIDTH, rate_hz: hz })),
+    ];
+  }
+
+  /**
+   * @param {string} stream
+   * @param {import("./slot.js").Delivery} delivery
+   * @returns {boolean} whether it takes the image
+   */
+  accept(stream, delivery) {
+    if (!this.isOpen || this.#renderer === null) {
+      return false;
+    }
+    const source = this.#sources.find((candidate) => candidate.isShown && (candidate.id === stream || candidate.colorId === stream));
+    return source?.accept(stream, delivery) ?? false;
+  }
+
+  #prepared() {
+    if (document.hidden || !this.isOpen || this.#renderer === null) {
+      this.#sources.forEach((source) => source.clear());
+      return;
+    }
+    this.redraw();
+  }
+
+  /** Follows the clock: points of a camera that has gone turn grey. @param {number} now ms */
+  tick(now) {
+    if (!this.isOpen) {
+      return;
+    }
+    const { isPaused, fastestHz } = this.#options.replay();
+    const hz = Math.min(MANY_HZ, fastestHz);
+    for (const source of this.#sources) {
+      const camera = this.#status?.cameras.find(({ name }) => name === source.camera);
+      const nominal = camera?.streams.find(({ id }) => id === source.id)?.nominal_hz ?? 0;
+      if (source.follow(camera, now, periodMs(hz, nominal), isPaused)) {
+        this.redraw();
+      }
+    }
+    this.#say();
+  }
+
+  redraw() {
+    this.#isDirty = true;
+    this.#askFrame();
+  }
+
+  #askFrame() {
+    if (this.isOpen && !this.#isFrameAsked) {
+      this.#isFrameAsked = true;
+      requestAnimationFrame(() => {
+        this.#isFrameAsked = false;
+        this.#frame(performance.now());
+      });
+    }
+  }
+
+  /** @param {number} now ms */
+  #frame(now) {
+    const renderer = this.#renderer;
+    if (renderer === null || !this.isOpen) {
+      return;
+    }
+    for (const source of this.#sources) {
+      this.#isDirty = source.upload(renderer) || this.#isDirty;
+    }
+    if (this.#drawing !== null && !renderer.isBusy) {
+      this.#ms = now - this.#drawing.at;
+      this.#thinning.drawn(this.#ms, this.#drawing.points);
+      this.#drawing = null;
+      this.facts.frames += 1;
+      this.facts.ms = this.#ms;
+    }
+    if (this.#drawing === null && this.#isDirty) {
+      this.#isDirty = false;
+      this.#draw(renderer, now);
+    }
+    if (this.#drawing !== null) {
+      this.#askFrame();
+    }
+  }
+
+  /**
+   * @param {CloudRenderer} renderer
+   * @param {number} now
+   */
+  #draw(renderer, now) {
+    this.#fit();
+    this.tick(now);
+    const offered = this.#sources.reduce((sum, source) => sum + source.offered, 0);
+    const share = Math.min(1, this.#thinning.budget / Math.max(1, offered));
+    const clouds = this.#sources.flatMap((source) => source.points(renderer, share) ?? []);
+    this.#homeIfDue(now);
+    const { width, height } = this.#canvas;
+    const projection = projectionMatrix(this.#orbit, width / Math.max(1, height));
+    const viewProjection = multiply(projection, viewMatrix(this.#orbit));
+    const { range, isAutomatic } = this.#options.range();
+    renderer.draw({
+      viewProjection,
+      scale: (projection[5] * height) / 2,
+      range,
+      isClipped: !isAutomatic,
+      paint: /** @type {Paint} */ (this.#paint.value),
+      clouds,
+      lines: this.#lines(),
+    });
+    const points = clouds.reduce((sum, { grid }) => sum + grid.columns * grid.rows, 0);
+    this.#drawing = { at: now, points };
+    this.#show(viewProjection, points, offered);
+  }
+
+  #fit() {
+    const ratio = Math.min(MOST_PIXEL_RATIO, devicePixelRatio);
+    const width = Math.max(1, Math.round(this.#box.clientWidth * ratio));
+    const height = Math.max(1, Math.round(this.#box.clientHeight * ratio));
+    if (this.#canvas.width !== width || this.#canvas.height !== height) {
+      this.#canvas.width = width;
+      this.#canvas.height = height;
+    }
+  }
+
+  /** Sources that have a place. */
+  get #placed() {
+    return this.#sources.filter(({ isShown, geometry }) => isShown && geometry !== null);
+  }
+
+  #lines() {
+    const depthM = FRUSTUM_SHARE * this.#orbit.distance;
+    const frusta = this.#placed.map((source) => {
+      const { intrinsics, width, height } = /** @type {Geometry} */ (source.geometry);
+      const pose = poseOf(/** @type {Geometry} */ (source.geometry));
+      const lines = frustumLines(intrinsics, width, height, pose, Math.min(0.25, depthM));
+      /** @type {[number, number, number]} */
+      const color = source.isStale || source.isGone ? [0.45, 0.45, 0.45] : source.tint;
+      return { lines, color };
+    });
+    const { up, target, distance } = this.#orbit;
+    const floor = floorLines(up, this.#floor, target, distance);
+    return [{ lines: floor.lines, color: /** @type {[number, number, number]} */ ([0.2, 0.22, 0.26]) }, ...frusta];
+  }
+
+  /**
+   * @param {number[]} viewProjection
+   * @param {number} points
+   * @param {number} offered
+   */
+  #show(viewProjection, points, offered) {
+    const placed = this.#placed;
+    const size = { width: this.#box.clientWidth, height: this.#box.clientHeight };
+    this.#labels.show(placed, viewProjection, size);
+    const count = (/** @type {number} */ n) => n.toLocaleString("en");
+    const { cellM } = floorLines(this.#orbit.up, 0, this.#orbit.target, this.#orbit.distance);
+    const speed = this.#ms > 0 ? ` · ${Math.round(this.#ms)} ms a frame` : "";
+    setText(this.#facts, `${count(points)} of ${count(offered)} points${speed} · floor cells ${cellM * 100} cm`);
+    Object.assign(this.facts, {
+      viewProjection, ...size, points, offered,
+      stale: this.#sources.filter(({ isStale }) => isStale).map(({ id }) => id),
+      placed: placed.map(({ id }) => id),
+    });
+  }
+
+  #reset() {
+    this.#isHomeDue = true;
+    this.#openedAt = -Infinity;
+    this.redraw();
+  }
+
+  /** @param {number} now ms */
+  #homeIfDue(now) {
+    const placed = this.#placed;
+    const ready = placed.filter(({ shown }) => shown !== null);
+    const isComplete = ready.length === this.#sources.filter(({ isShown }) => isShown).length;
+    if (!this.#isHomeDue || ready.length === 0 || (!isComplete && now - this.#openedAt < HOME_WAIT_MS)) {
+      return;
+    }
+    this.#isHomeDue = false;
+    const poses = ready.map(({ geometry }) => poseOf(/** @type {Geometry} */ (geometry)));
+    const samples = ready.flatMap((source) => source.samples(SAMPLES));
+    const up = AXES[this.#up.value] ?? upOf(poses);
+    const depthM = quantile(samples.map((sample) => sample.depthM), 0.5, DEPTH_UNKNOWN_M);
+    this.#orbit = home(poses, depthM, up);
+    const lowest = dot(this.#orbit.target, up) - 0.5;
+    this.#floor = quantile(samples.map(({ point }) => dot(point, up)), 0.02, lowest);
+  }
+
+  #nextPaint() {
+    this.#paint.selectedIndex = (this.#paint.selectedIndex + 1) % this.#paint.options.length;
+    announce(this.#paint.selectedOptions[0]?.text ?? "");
+    this.redraw();
+  }
+
+  #limitChanged() {
+    const { value } = this.#limit;
+    this.#thinning.setLimit(value === "auto" ? null : Number(value));
+    this.#options.askWatch();
+    this.redraw();
+  }
+
+  #offerCameras() {
+    const boxes = this.#sources.map((source) => {
+      const label = make("label", "check");
+      const box = document.createElement("input");
+      box.type = "checkbox";
+      box.checked = source.isShown;
+      box.addEventListener("change", () => {
+        source.isShown = box.checked;
+        source.clear();
+        this.#options.askWatch();
+        this.redraw();
+      });
+      const swatch = make("span", "swatch");
+      swatch.style.background = `rgb(${source.tint.map((part) => Math.round(part * 255)).join(" ")})`;
+      const name = document.createElement("span");
+      name.textContent = this.#nameOf(source);
+      label.append(box, swatch, name);
+      return label;
+    });
+    this.#cameras.replaceChildren(...boxes);
+  }
+
+  /** @param {CloudSource} source */
+  #nameOf(source) {
+    return this.#sources.filter(({ camera }) => camera === source.camera).length > 1 ? source.id : source.camera;
+  }
+
+  #say() {
+    if (this.isOpen) {
+      setText(this.#message, this.#isLost ? LOST : this.#hasNoWebgl ? NO_WEBGL : this.#hint());
+    }
+  }
+
+  /** What the picture cannot show. */
+  #hint() {
+    const shown = this.#sources.filter(({ isShown }) => isShown);
+    if (shown.length === 0) {
+      return this.#sources.length === 0 ? "This rig has no depth stream." : "No camera is chosen.";
+    }
+    const unplaced = shown.filter(({ id, geometry }) => this.#geometries.has(id) && geometry === null);
+    if (unplaced.length > 0) {
+      const names = unplaced.map(({ id }) => id).join(", ");
+      return `${names}: the lens is not known, so that its points have no place. Give its intrinsics in the rig file.`;
+    }
+    const poses = this.#placed.map(({ geometry }) => JSON.stringify(poseOf(/** @type {Geometry} */ (geometry))));
+    const cameras = new Set(this.#placed.map(({ camera }) => camera));
+    return cameras.size > 1 && new Set(poses).size === 1 ? SAME_POSES : "";
+  }
+}
+
+
