@@ -101,14 +101,14 @@ export function floorLines(up, height, about, reach) {
 }
 
 /**
- * Some points of a depth image on the mount, evenly spread, with how far each is away.
+ * Some points of a depth image on the mount, evenly spread.
  *
  * @param {Uint16Array} depth
  * @param {Float32Array} rays `rayTable` of the image
  * @param {number} unitM
  * @param {Matrix} pose
  * @param {number} limit
- * @returns {{point: Vector, depthM: number}[]}
+ * @returns {Vector[]}
  */
 export function samplePoints(depth, rays, unitM, pose, limit) {
   // An odd stride walks over all columns of the usual even widths.
@@ -117,20 +117,8 @@ export function samplePoints(depth, rays, unitM, pose, limit) {
   for (let i = 0; i < depth.length; i += stride) {
     if (depth[i] !== 0 && rays[2 * i] !== NO_RAY) {
       const z = depth[i] * unitM;
-      samples.push({ point: placed(pose, [rays[2 * i] * z, rays[2 * i + 1] * z, z]), depthM: z });
+      samples.push(placed(pose, [rays[2 * i] * z, rays[2 * i + 1] * z, z]));
     }
   }
   return samples;
-}
-
-/**
- * The value below which this share of the values lies; `fallback` without values.
- *
- * @param {number[]} values
- * @param {number} share
- * @param {number} fallback
- */
-export function quantile(values, share, fallback) {
-  const sorted = [...values].sort((a, b) => a - b);
-  return sorted[Math.round(share * (sorted.length - 1))] ?? fallback;
 }

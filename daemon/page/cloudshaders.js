@@ -80,7 +80,7 @@ void main() {
   }
   vec3 point = vec3(ray, 1.0) * z;
   gl_Position = view_projection * (pose * vec4(point, 1.0));
-  gl_PointSize = clamp(pixel_size * z / gl_Position.w, 1.0, 7.0);
+  gl_PointSize = clamp(1.4 * pixel_size * z / gl_Position.w, 1.0, 9.0);
   if (paint == 1) {
     color = by_distance(z);
   } else {

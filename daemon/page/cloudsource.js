@@ -12,8 +12,11 @@ import { thinGrid } from "./thinning.js";
 /** @typedef {import("./cloudgl.js").CloudRenderer} CloudRenderer */
 /** @typedef {import("./slot.js").Prepared} Prepared */
 
-/** So long after an image was due, the points turn grey; much later they go. */
-const STALE_MS = 500;
+/**
+ * So long after an image was due, the points turn grey; much later they go. A computer that draws with its CPU takes
+ * images slower than they are made, so that this is longer than on the wall; a camera that is lost is grey at once.
+ */
+const STALE_MS = 1000;
 const GONE_MS = 5000;
 
 /** @type {[number, number, number][]} as far apart as can be, and none of them grey */

@@ -3,11 +3,11 @@
 import { CloudRenderer, poseOf } from "./cloudgl.js";
 import { CloudInput } from "./cloudinput.js";
 import { CloudLabels } from "./cloudlabels.js";
-import { AXES, floorLines, frustumLines, quantile, upOf } from "./cloudscene.js";
+import { AXES, floorLines, frustumLines, upOf } from "./cloudscene.js";
 import { CloudSource, TINTS, sourcesOf } from "./cloudsource.js";
 import { announce, byId, make, setText } from "./dom.js";
 import { dot, multiply } from "./matrix.js";
-import { home, projectionMatrix, viewMatrix } from "./orbit.js";
+import { home, projectionMatrix, quantile, viewMatrix } from "./orbit.js";
 import { SMALL_WIDTH, Thinning, cloudWidth } from "./thinning.js";
 import { isDepthFormat } from "./tile.js";
 import { periodMs } from "./tilestate.js";
@@ -24,7 +24,6 @@ const MANY_HZ = 5;
 const SAMPLES = 400;
 /** The view is placed once every camera has an image, or when it is clear that one of them has none. */
 const HOME_WAIT_MS = 1500;
-const DEPTH_UNKNOWN_M = 1.5;
 const FRUSTUM_SHARE = 0.16;
 const MOST_PIXEL_RATIO = 2;
 
@@ -409,10 +408,9 @@ export class CloudView {
     const poses = ready.map(({ geometry }) => poseOf(/** @type {Geometry} */ (geometry)));
     const samples = ready.flatMap((source) => source.samples(SAMPLES));
     const up = AXES[this.#up.value] ?? upOf(poses);
-    const depthM = quantile(samples.map((sample) => sample.depthM), 0.5, DEPTH_UNKNOWN_M);
-    this.#orbit = home(poses, depthM, up);
-    const lowest = dot(this.#orbit.target, up) - 0.5;
-    this.#floor = quantile(samples.map(({ point }) => dot(point, up)), 0.02, lowest);
+    this.#orbit = home(poses, samples, up);
+    const heights = samples.length > 0 ? samples : [this.#orbit.target];
+    this.#floor = quantile(heights.map((point) => dot(point, up)), 0.02);
   }
 
   #nextPaint() {

@@ -20,7 +20,12 @@ const STEEPEST = (89 * Math.PI) / 180;
 const NEAREST_M = 0.02;
 const FARTHEST_M = 100;
 /** A home view looks down a little, so that planes across the line of sight have depth. */
-const HOME_PITCH = (22 * Math.PI) / 180;
+const HOME_PITCH = (24 * Math.PI) / 180;
+/** A little from the side, so that the lines of sight have a length. */
+const HOME_YAW = (20 * Math.PI) / 180;
+const HOME_MARGIN = 0.85;
+/** Without depth, cameras are taken to see so far. */
+const BLIND_M = 1.5;
 
 /**
  * Two directions across `up`, the same for the same `up`.
@@ -108,29 +113,51 @@ export function zoomed(orbit, factor) {
 }
 
 /**
- * The view from behind the cameras, or from beside them when they look at each other.
+ * The view from behind the cameras, or from beside them when they look at each other, with most points in it.
  *
  * @param {Matrix[]} poses of the cameras, at least one
- * @param {number} depthM how far away most of what they see is
+ * @param {Vector[]} points that they see
  * @param {Vector} up
  * @returns {Orbit}
  */
-export function home(poses, depthM, up) {
-  const share = 1 / poses.length;
-  /** @type {Vector} */
-  let target = [0, 0, 0];
+export function home(poses, points, up) {
+  const seen = points.length > 0 ? points : poses.map((pose) => ahead(pose, BLIND_M));
+  const target = /** @type {Vector} */ ([0, 1, 2].map((i) => quantile(seen.map((point) => point[i]), 0.5)));
   /** @type {Vector} */
   let forward = [0, 0, 0];
   for (const pose of poses) {
-    const ahead = rotate(pose, [0, 0, 1]);
-    const seen = add([pose[12], pose[13], pose[14]], scale(ahead, depthM));
-    target = add(target, scale(seen, share));
-    forward = add(forward, scale(ahead, share));
+    forward = add(forward, scale(rotate(pose, [0, 0, 1]), 1 / poses.length));
   }
-  const reach = Math.max(...poses.map((pose) => length(subtract([pose[12], pose[13], pose[14]], target))));
+  const away = (/** @type {Vector} */ point) => length(subtract(point, target));
+  const reach = quantile(seen.map(away), 0.9);
+  // The cameras are in it too, unless what they see is far smaller than its distance.
+  const toCameras = Math.min(4 * reach, Math.max(...poses.map((pose) => away(ahead(pose, 0)))));
+  const distance = Math.max(0.3, (HOME_MARGIN * Math.max(reach, toCameras)) / Math.tan(FOV_Y / 2));
   const [first, second] = across(up);
   const level = subtract(forward, scale(up, dot(forward, up)));
   const isCommon = length(level) > 0.3;
-  const yaw = isCommon ? Math.atan2(-dot(level, second), -dot(level, first)) : 0;
-  return { target, up, distance: Math.max(0.3, reach * 1.35), yaw, pitch: HOME_PITCH };
+  const yaw = isCommon ? Math.atan2(-dot(level, second), -dot(level, first)) + HOME_YAW : 0;
+  return { target, up, distance, yaw, pitch: HOME_PITCH };
+}
+
+/**
+ * A point on the optical axis.
+ *
+ * @param {Matrix} pose
+ * @param {number} metres
+ * @returns {Vector}
+ */
+function ahead(pose, metres) {
+  return add([pose[12], pose[13], pose[14]], scale(rotate(pose, [0, 0, 1]), metres));
+}
+
+/**
+ * The value below which this share of the values lies.
+ *
+ * @param {number[]} values at least one
+ * @param {number} share
+ */
+export function quantile(values, share) {
+  const sorted = [...values].sort((a, b) => a - b);
+  return sorted[Math.round(share * (sorted.length - 1))];
 }
