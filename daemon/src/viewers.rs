@@ -4,6 +4,7 @@
 //! stream only the newest frame is sent, so a viewer that is slow sees fewer images and never old ones. One thread encodes, below the priority of
 //! everything that captures; it exists while somebody watches.
 
+mod geometry;
 mod pixel;
 mod worker;
 
@@ -11,9 +12,11 @@ use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::sync::lock;
 use depthrig_bus::{HostTime, RigName, RuntimeDir, StreamId};
-use depthrig_recorder::preview::PreviewKind;
+use depthrig_recorder::preview::{Measure, PreviewKind};
+pub(crate) use geometry::Geometry;
 use hyper::body::Bytes;
 pub(crate) use pixel::{PixelAnswer, PixelQuestion};
+use serde::Serialize;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Condvar, Mutex};
 use tokio::sync::mpsc;
@@ -28,8 +31,8 @@ pub(crate) const CREDITS: u32 = 4;
 const MAX_RATE_HZ: f64 = 60.0;
 /// Questions about pixels that may wait; a pointer that moves asks again.
 const MAX_QUESTIONS: usize = 4;
-/// Messages to a viewer that may wait: its credits, and the answers to its questions.
-const MAX_MESSAGES: usize = CREDITS as usize + 2 * MAX_QUESTIONS;
+/// Messages to a viewer that may wait: its images, each with its geometry and its numbers, and the answers to its questions.
+const MAX_MESSAGES: usize = 3 * CREDITS as usize + 2 * MAX_QUESTIONS;
 
 /// A stream that a viewer watches.
 #[derive(Debug, Clone, PartialEq, serde::Deserialize)]
@@ -41,6 +44,9 @@ pub(crate) struct Watch {
     pub width: u32,
     /// Images a second at the most.
     pub rate_hz: f64,
+    /// Whether numbers of the full image come with it.
+    #[serde(default)]
+    pub measure: bool,
 }
 
 /// An answer for a viewer.
@@ -48,10 +54,32 @@ pub(crate) struct Watch {
 pub(crate) enum Message {
     /// An image with its head.
     Image(Bytes),
+    /// Where the pixels of a stream are.
+    Geometry(Box<OfStream<Geometry>>),
+    /// Numbers of an image.
+    Measure(Box<OfStream<Measured>>),
     /// The depth and the place of a pixel.
     Pixel(PixelAnswer),
     /// Why a stream is not shown.
     Problem(String),
+}
+
+/// Something of a stream.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(crate) struct OfStream<T> {
+    /// Its name, `camera/stream`.
+    pub stream: StreamId,
+    #[serde(flatten)]
+    pub what: T,
+}
+
+/// Numbers of a frame.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(crate) struct Measured {
+    /// Of the frame.
+    pub sequence: u64,
+    #[serde(flatten)]
+    pub numbers: Measure,
 }
 
 /// Viewers of one rig.
@@ -96,6 +124,12 @@ struct Watched {
     due: HostTime,
     /// Frame that was sent last.
     sent: Option<u64>,
+    /// The geometry that was sent last.
+    geometry: Option<Geometry>,
+    /// Whether numbers of the full image are wanted.
+    measure: bool,
+    /// Frame whose numbers were sent last.
+    measured: Option<u64>,
 }
 
 /// A place among the viewers; dropping it frees the place.
@@ -144,7 +178,7 @@ impl Place {
         }
         let now = HostTime::now();
         let mut watched = Vec::with_capacity(wanted.len());
-        for Watch { stream, width, rate_hz } in wanted {
+        for Watch { stream, width, rate_hz, measure } in wanted {
             let Ok(id) = stream.parse::<StreamId>() else {
                 return bad(format!("invalid stream name \"{stream}\"; write camera/stream"));
             };
@@ -152,7 +186,16 @@ impl Place {
                 return bad(format!("rate_hz = {rate_hz} is out of range 0..={MAX_RATE_HZ}"));
             }
             let period = Duration::from_secs_f64(1.0 / rate_hz);
-            watched.push(Watched { id, width: *width, period, due: now, sent: None });
+            watched.push(Watched {
+                id,
+                width: *width,
+                period,
+                due: now,
+                sent: None,
+                geometry: None,
+                measure: *measure,
+                measured: None,
+            });
         }
         self.change(|viewer| {
             viewer.watched = watched;

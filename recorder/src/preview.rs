@@ -3,6 +3,10 @@
 //! Made for looking at, quickly: a JPEG has 4:2:0 colour and is a mean of the pixels that it stands for. Depth is never averaged, because a mean of two
 //! surfaces is a place where nothing is.
 
+mod measure;
+
+pub use measure::{LUMA_BINS, Measure, measure};
+
 use crate::still::tight;
 use crate::{Error, ErrorKind, Result};
 use depthrig_bus::{FrameHeader, Layout, PixelFormat, Sample};
@@ -45,14 +49,11 @@ pub struct Preview {
 /// # Errors
 /// [`ErrorKind::BadInput`] for a frame that is not an image or does not have the size that its header says, [`ErrorKind::Codec`] when it cannot be encoded.
 pub fn preview(h: &FrameHeader, pixels: &[u8], max_width: u32) -> Result<Preview> {
-    let refused = |why: &str| {
-        let what = format!("frame {} of {}/{} has no preview: {why}", h.sequence, h.camera(), h.stream());
-        Error::new(ErrorKind::BadInput, what)
-    };
-    let format = h.pixel_format().ok_or_else(|| refused("its pixel format is unknown"))?;
-    let pixels =
-        pixels.get(..h.payload_len as usize).ok_or_else(|| refused("it is shorter than its header says"))?;
-    let size = |n: u32| u16::try_from(n).map_err(|_| refused("it has more than 65535 pixels per side"));
+    let format = h.pixel_format().ok_or_else(|| refused(h, "its pixel format is unknown"))?;
+    let pixels = pixels
+        .get(..h.payload_len as usize)
+        .ok_or_else(|| refused(h, "it is shorter than its header says"))?;
+    let size = |n: u32| u16::try_from(n).map_err(|_| refused(h, "it has more than 65535 pixels per side"));
     if format.layout() == Layout::Jpeg {
         return Ok(Preview {
             kind: PreviewKind::Jpeg,
@@ -65,7 +66,7 @@ pub fn preview(h: &FrameHeader, pixels: &[u8], max_width: u32) -> Result<Preview
     }
     let pixels = tight(h, pixels, format);
     if h.width == 0 || h.height == 0 || pixels.len() != format.frame_bytes(h.width, h.height) {
-        return Err(refused("its size is not what its header says"));
+        return Err(refused(h, "its size is not what its header says"));
     }
     let step = if max_width == 0 { 1 } else { h.width.div_ceil(max_width).min(h.width).min(h.height) };
     let grid = Grid {
@@ -104,8 +105,13 @@ pub fn preview(h: &FrameHeader, pixels: &[u8], max_width: u32) -> Result<Preview
             0.0,
             grid.jpeg(&grid.of_yuv(&pixels, h.height as usize, format.layout()), ColorType::Rgb)?,
         ),
-        (_, Layout::Motion | Layout::Jpeg, _) => Err(refused("it is not an image")),
+        (_, Layout::Motion | Layout::Jpeg, _) => Err(refused(h, "it is not an image")),
     }
+}
+
+fn refused(h: &FrameHeader, why: &str) -> Error {
+    let what = format!("frame {} of {}/{} cannot be shown: {why}", h.sequence, h.camera(), h.stream());
+    Error::new(ErrorKind::BadInput, what)
 }
 
 /// Which pixels of an image those of its preview stand for.

@@ -255,6 +255,78 @@ def page_answer(stream: str, x: int) -> dict:
     return {"id": 8, "stream": stream, "x": x, "y": 1, "depth_m": None, "seen": []}
 
 
+def test_the_geometry_of_a_stream_comes_once_before_its_first_image(rig: Rig, runtime: Path) -> None:
+    header = depthrig.Stream("left/depth", runtime_dir=runtime, timeout=WAIT_S).next(timeout=WAIT_S).header
+    with rig.page(WALL[2:]) as page:
+        geometry: dict[str, dict] = {}
+        for _ in range(12):
+            while not isinstance(message := page.message(), Sent):
+                if "geometry" in message:
+                    assert message["geometry"]["stream"] not in geometry, "sent twice"
+                    geometry[message["geometry"]["stream"]] = message["geometry"]
+            assert message.stream in geometry
+            page.say(credit=1)
+    told = geometry["left/depth"]
+    assert (told["width"], told["height"]) == (header.width, header.height)
+    assert told["depth_unit_m"] == header.depth_unit_m
+    assert told["translation_m"] == list(header.pose.translation_m)
+    assert told["rotation_xyzw"] == list(header.pose.rotation_xyzw)
+    k = header.intrinsics
+    inside = told["intrinsics"]
+    assert [inside[name] for name in ("fx", "fy", "cx", "cy")] == [k.fx, k.fy, k.cx, k.cy]
+    assert inside["model"] in ("none", "brown_conrady", "inverse_brown_conrady")
+    assert inside["coeffs"] == list(k.coeffs)
+
+
+def test_the_numbers_of_an_image_are_those_of_the_full_frame(rig: Rig, runtime: Path) -> None:
+    color = depthrig.Stream("front/color", runtime_dir=runtime, timeout=WAIT_S)
+    depth = depthrig.Stream("front/depth", runtime_dir=runtime, timeout=WAIT_S)
+    watched = [{"stream": f"front/{s}", "width": 64, "rate_hz": 30, "measure": True} for s in ("color", "depth")]
+    with rig.page(watched) as page:
+        frames: dict[tuple[str, int], np.ndarray] = {}
+        told: dict[tuple[str, int], dict] = {}
+        until = time.monotonic() + WAIT_S
+        while len({stream for stream, _ in frames.keys() & told.keys()}) < 2:
+            assert time.monotonic() < until
+            for name, stream in (("front/color", color), ("front/depth", depth)):
+                frame = stream.latest()
+                if frame is not None:
+                    frames[name, frame.header.sequence] = np.array(frame.array)
+            message = page.message()
+            if isinstance(message, Sent):
+                page.say(credit=1)
+            elif numbers := message.get("measure"):
+                told[numbers["stream"], numbers["sequence"]] = numbers
+        for key in frames.keys() & told.keys():
+            image = frames[key]
+            numbers = told[key]
+            if key[0] == "front/depth":
+                assert numbers["holes"] == pytest.approx(np.mean(image == 0))
+                assert numbers["sharpness"] is None
+                continue
+            luma = (image.astype(np.uint32) @ [77, 150, 29] + 128) >> 8
+            v = luma.astype(float)
+            laplacian = 4 * v[1:-1, 1:-1] - v[:-2, 1:-1] - v[2:, 1:-1] - v[1:-1, :-2] - v[1:-1, 2:]
+            assert numbers["sharpness"] == pytest.approx(np.mean(laplacian**2))
+            np.testing.assert_allclose(numbers["luma"], np.histogram(luma, 64, (0, 256))[0] / luma.size)
+            assert numbers["bright"] == pytest.approx(np.mean(image.max(axis=2) >= 254))
+            assert numbers["dark"] == pytest.approx(np.mean(luma <= 1))
+
+
+def test_numbers_come_at_most_five_times_a_second_and_only_if_asked_for(rig: Rig) -> None:
+    for measure, least, most in ((True, 4, 13), (False, 0, 0)):
+        with rig.page([{"stream": "front/color", "width": 64, "rate_hz": 30, "measure": measure}]) as page:
+            page.image()
+            count = 0
+            until = time.monotonic() + 2
+            while time.monotonic() < until:
+                message = page.message()
+                if isinstance(message, Sent):
+                    page.say(credit=1)
+                count += isinstance(message, dict) and "measure" in message
+            assert least <= count <= most
+
+
 def test_nothing_is_encoded_when_nobody_watches(rig: Rig) -> None:
     with rig.page(WALL) as page:
         page.image()

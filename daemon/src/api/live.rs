@@ -5,7 +5,9 @@ use super::reply::Refusal;
 use super::token::Token;
 use crate::control::Control;
 use crate::status::RigStatus;
-use crate::viewers::{Message, PROTOCOL, PixelAnswer, PixelQuestion, Place, Viewers, Watch};
+use crate::viewers::{
+    Geometry, Measured, Message, OfStream, PROTOCOL, PixelAnswer, PixelQuestion, Place, Viewers, Watch,
+};
 use axum::Extension;
 use axum::extract::State;
 use axum::extract::ws::{CloseFrame, Message as Frame, WebSocket, WebSocketUpgrade};
@@ -65,6 +67,8 @@ enum Request {
 enum Answer<'a> {
     Hello(Hello<'a>),
     Status(&'a RigStatus),
+    Geometry(&'a OfStream<Geometry>),
+    Measure(&'a OfStream<Measured>),
     Pixel(PixelAnswer),
     Problem { message: String },
 }
@@ -184,6 +188,8 @@ impl Client {
                 }
                 message = self.messages.recv() => match message {
                     Some(Message::Image(bytes)) => socket.send(Frame::Binary(bytes)).await,
+                    Some(Message::Geometry(geometry)) => send(socket, &Answer::Geometry(&geometry)).await,
+                    Some(Message::Measure(measured)) => send(socket, &Answer::Measure(&measured)).await,
                     Some(Message::Pixel(answer)) => send(socket, &Answer::Pixel(answer)).await,
                     Some(Message::Problem(message)) => send(socket, &Answer::Problem { message }).await,
                     None => return None,

@@ -1,11 +1,11 @@
 //! The thread that encodes.
 
-use super::{Head, Message, Shared, State, pixel};
+use super::{Geometry, Head, Measured, Message, OfStream, Shared, State, Viewer, Watched, pixel};
 use crate::priority;
 use core::time::Duration;
 use depthrig_bus::sync::lock;
 use depthrig_bus::{Bus, Frame, HostTime, StreamId, Subscriber};
-use depthrig_recorder::preview::{Preview, preview};
+use depthrig_recorder::preview::{Preview, measure, preview};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::PoisonError;
 use tokio::sync::mpsc::error::TrySendError;
@@ -14,6 +14,8 @@ use tokio::sync::mpsc::error::TrySendError;
 const POLL: Duration = Duration::from_millis(5);
 /// Pause before a stream that does not exist is looked for again.
 const RETRY: Duration = Duration::from_millis(500);
+/// Pause between two measurements of a stream.
+const MEASURE_PERIOD: Duration = Duration::from_millis(200);
 /// The longest wait, when no viewer has credit.
 const IDLE: Duration = Duration::from_secs(1);
 
@@ -39,6 +41,16 @@ struct Worker {
     frames: BTreeMap<StreamId, Frame>,
     /// The images encoded last, for viewers that come a little later.
     encoded: BTreeMap<Size, Encoded>,
+    /// The numbers measured last.
+    measured: BTreeMap<StreamId, Numbers>,
+}
+
+/// Numbers of a stream's frame.
+struct Numbers {
+    /// When they may be measured anew.
+    due: HostTime,
+    /// `None` if it could not be measured.
+    measured: Option<Measured>,
 }
 
 /// A stream at a width.
@@ -70,11 +82,19 @@ struct Job {
     id: StreamId,
     width: u32,
     due: HostTime,
+    /// Whether the numbers of the full image go with it.
+    measure: bool,
 }
 
 impl Worker {
     const fn new(bus: Bus) -> Self {
-        Self { bus, streams: BTreeMap::new(), frames: BTreeMap::new(), encoded: BTreeMap::new() }
+        Self {
+            bus,
+            streams: BTreeMap::new(),
+            frames: BTreeMap::new(),
+            encoded: BTreeMap::new(),
+            measured: BTreeMap::new(),
+        }
     }
 
     fn run(mut self, shared: &Shared) {
@@ -92,6 +112,7 @@ impl Worker {
             self.streams.retain(|id, _| watched.contains(id));
             self.frames.retain(|id, _| watched.contains(id));
             self.encoded.retain(|size, _| watched.contains(&size.id));
+            self.measured.retain(|id, _| watched.contains(id));
             for id in watched {
                 self.take_newest(id, shared);
             }
@@ -159,7 +180,8 @@ impl Worker {
                 let newest = self.frames.get(&watched.id).map(|f| f.header().sequence);
                 if watched.due <= now && newest.is_some() && newest != watched.sent {
                     let id = watched.id.clone();
-                    jobs.push(Job { viewer: *number, index, id, width: watched.width, due: watched.due });
+                    let Watched { width, due, measure, .. } = *watched;
+                    jobs.push(Job { viewer: *number, index, id, width, due, measure });
                 }
             }
         }
@@ -181,16 +203,22 @@ impl Worker {
                 let image = made.map_err(|e| tell(shared, &job.id, &e)).ok();
                 self.encoded.insert(size.clone(), Encoded { sequence: header.sequence, image });
             }
+            if job.measure {
+                self.measure(&job.id, shared);
+            }
+            let Some(frame) = self.frames.get(&job.id) else { continue };
+            let header = frame.header();
             let image = self.encoded.get(&size).and_then(|e| e.image.as_ref());
             let mut state = lock(&shared.state);
             let Some(viewer) = state.viewers.get_mut(&job.viewer) else { continue };
             let generation = viewer.generation;
-            let Some(watched) = viewer.watched.get_mut(job.index).filter(|w| w.id == job.id) else {
-                continue;
-            };
+            // The viewer may have asked for something else since the job was found.
+            let is_wanted = |w: &&mut Watched| w.id == job.id && w.width == job.width;
+            let Some(watched) = viewer.watched.get_mut(job.index).filter(is_wanted) else { continue };
             watched.sent = Some(header.sequence);
             watched.due = next_turn(&watched.id, watched.period);
             let Some(image) = image else { continue };
+            self.describe(viewer, &job);
             let head = Head {
                 kind: image.kind,
                 index: job.index as u16,
@@ -209,6 +237,42 @@ impl Worker {
                 Ok(()) => viewer.credits -= 1,
                 // It does not read, or has gone.
                 Err(TrySendError::Full(_) | TrySendError::Closed(_)) => {}
+            }
+        }
+    }
+
+    /// Measures the newest frame of a stream, unless that was done a moment ago.
+    fn measure(&mut self, id: &StreamId, shared: &Shared) {
+        let Some(frame) = self.frames.get(id) else { return };
+        let now = HostTime::now();
+        if self.measured.get(id).is_some_and(|m| m.due > now) {
+            return;
+        }
+        let header = frame.header();
+        let numbers = measure(header, frame.pixels()).map_err(|e| tell(shared, id, &e)).ok();
+        let measured = numbers.map(|numbers| Measured { sequence: header.sequence, numbers });
+        self.measured.insert(id.clone(), Numbers { due: now.plus(MEASURE_PERIOD), measured });
+    }
+
+    /// Sends what goes with an image: the geometry, when it is new to the viewer, and the numbers.
+    fn describe(&self, viewer: &mut Viewer, job: &Job) {
+        let Some(frame) = self.frames.get(&job.id) else { return };
+        let Some(watched) = viewer.watched.get_mut(job.index) else { return };
+        let geometry = Geometry::of(frame.header());
+        if watched.geometry != Some(geometry) {
+            let message = OfStream { stream: job.id.clone(), what: geometry };
+            if viewer.to.try_send(Message::Geometry(message.into())).is_ok() {
+                watched.geometry = Some(geometry);
+            }
+        }
+        let numbers = self.measured.get(&job.id).and_then(|m| m.measured.as_ref());
+        if let Some(numbers) = numbers
+            && watched.measure
+            && watched.measured != Some(numbers.sequence)
+        {
+            let message = OfStream { stream: job.id.clone(), what: numbers.clone() };
+            if viewer.to.try_send(Message::Measure(message.into())).is_ok() {
+                watched.measured = Some(numbers.sequence);
             }
         }
     }
