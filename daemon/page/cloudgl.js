@@ -47,7 +47,7 @@ const UNITS = { depth: 0, rays: 1, color: 2, turbo: 3 };
 
 /** @param {Geometry} geometry */
 export function poseOf(geometry) {
-  return poseMatrix(geometry.rotation, geometry.translation_m);
+  return poseMatrix(geometry.rotation_xyzw, geometry.translation_m);
 }
 
 export class CloudRenderer {

@@ -37,6 +37,7 @@ const SAME_POSES =
 /**
  * @typedef {Object} CloudOptions
  * @property {() => void} askWatch
+ * @property {ReadonlyMap<string, Geometry>} geometries by stream
  * @property {() => {range: import("./colormap.js").Range, isAutomatic: boolean}} range
  * @property {() => {isPaused: boolean, fastestHz: number}} replay
  * @property {(isOpen: boolean) => void} onToggled
@@ -60,8 +61,8 @@ export class CloudView {
   #renderer = null;
   #hasNoWebgl = false;
   #isLost = false;
-  /** @type {Map<string, Geometry>} by stream, since the page was opened */
-  #geometries = new Map();
+  /** @type {ReadonlyMap<string, Geometry>} by stream */
+  #geometries;
   /** @type {CloudSource[]} */
   #sources = [];
   #built = "";
@@ -99,6 +100,7 @@ export class CloudView {
   /** @param {CloudOptions} options */
   constructor(options) {
     this.#options = options;
+    this.#geometries = options.geometries;
     new CloudInput(this.#canvas, {
       orbit: () => this.#orbit,
       move: (orbit) => {
@@ -195,14 +197,6 @@ export class CloudView {
       }
       this.#offerCameras();
       this.#options.askWatch();
-    }
-  }
-
-  /** @param {Geometry} geometry */
-  place(geometry) {
-    this.#geometries.set(geometry.stream, geometry);
-    if (this.isOpen) {
-      this.redraw();
     }
   }
 

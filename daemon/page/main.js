@@ -1,5 +1,6 @@
 /** Puts the page together. */
 
+import { Aids } from "./aids.js";
 import { takeToken } from "./api.js";
 import { Blend } from "./blend.js";
 import { CloudView } from "./cloudview.js";
@@ -33,6 +34,9 @@ Object.assign(window, { depthrig: debug });
 /** @type {Status | null} */
 let status = null;
 
+/** @type {Map<string, import("./types.js").Geometry>} by stream */
+const geometries = new Map();
+
 const range = new DepthRange(() => {
   wall.redrawAll((tile) => tile.isDepth || tile === wall.enlarged);
   cloud.redraw();
@@ -46,6 +50,7 @@ const wall = new Wall({
   tables: range.tables,
   onEnlarged: (tile) => {
     blend.enlarged(wall.tiles.values(), tile);
+    aids.enlarged(tile);
     // Marks were set for tiles of another size.
     hover.hide();
   },
@@ -57,12 +62,16 @@ const wall = new Wall({
       debug.ages.shift();
     }
     labels.drawn(tile, ageMs);
+    aids.drawn(tile);
   },
+  isMeasured: () => aids.isShown,
   watchInstead: () => cloud.watch(),
   takeInstead: (stream, delivery) => cloud.accept(stream, delivery),
 });
+const aids = new Aids({ askWatch: () => wall.askWatch(), geometries });
 const cloud = new CloudView({
   askWatch: () => wall.askWatch(),
+  geometries,
   range: () => range.current,
   replay: () => ({
     isPaused: replayBar.isShown && replayBar.isWaiting,
@@ -73,7 +82,7 @@ const cloud = new CloudView({
     hover.hide();
   },
 });
-Object.assign(debug, { view: cloud.facts });
+Object.assign(debug, { view: cloud.facts, aids });
 const labels = new TileLabels(wall);
 const hover = new Hover(wall.tiles, (id, place) => connection.askPixel(id, place));
 const recordBar = new RecordBar();
@@ -85,8 +94,11 @@ const connection = new Connection({
   onStatus: showStatus,
   onImage: (image, credit) => wall.accept(image, credit),
   onPixel: (answer) => hover.answer(answer),
-  onGeometry: (geometry) => cloud.place(geometry),
-  onMeasure: () => {},
+  onGeometry: (geometry) => {
+    geometries.set(geometry.stream, geometry);
+    cloud.redraw();
+  },
+  onMeasure: (measure) => aids.measured(measure),
   onProblem: showProblem,
 });
 
@@ -204,7 +216,7 @@ function act(action) {
     case "cloud":
       return cloud.toggle();
     case "aids":
-      return undefined;
+      return showAids();
     case "camera":
       cloud.close();
       return wall.enlargeCamera(action.n);
@@ -218,6 +230,26 @@ function act(action) {
       return replayBar.isShown ? replayBar.togglePause() : undefined;
     case "step":
       return replayBar.isShown ? replayBar.step(action.sets) : undefined;
+  }
+}
+
+/** Aids go with an enlarged image: without one, the tile that has the focus or the first is enlarged. */
+function showAids() {
+  if (cloud.isOpen) {
+    return;
+  }
+  if (wall.enlarged !== null) {
+    aids.toggle();
+    return;
+  }
+  const focused = document.activeElement;
+  const id = focused instanceof HTMLElement ? focused.dataset.stream : undefined;
+  const tile = wall.tiles.get(id ?? "") ?? [...wall.tiles.values()][0];
+  if (tile !== undefined) {
+    wall.enlarge(tile);
+    if (!aids.isOpen) {
+      aids.toggle();
+    }
   }
 }
 

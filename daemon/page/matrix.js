@@ -113,13 +113,13 @@ export function rotate(m, [x, y, z]) {
 /**
  * The pose `p' = R p + t` as a matrix.
  *
- * @param {[number, number, number, number]} rotation quaternion w x y z
+ * @param {[number, number, number, number]} rotation quaternion x y z w
  * @param {Vector} translation
  * @returns {Matrix}
  */
 export function poseMatrix(rotation, translation) {
   const size = Math.hypot(...rotation) || 1;
-  const [w, x, y, z] = rotation.map((part) => part / size);
+  const [x, y, z, w] = rotation.map((part) => part / size);
   return [
     1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y), 0,
     2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x), 0,

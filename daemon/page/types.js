@@ -86,8 +86,8 @@
  * @property {number} height
  * @property {number} depth_unit_m
  * @property {Intrinsics} intrinsics
- * @property {[number, number, number, number]} rotation quaternion w x y z, from the optical frame to the mount
- * @property {[number, number, number]} translation_m
+ * @property {[number, number, number]} translation_m of the optical frame on the mount
+ * @property {[number, number, number, number]} rotation_xyzw
  *
  * @typedef {Object} Measure of a full image
  * @property {string} stream

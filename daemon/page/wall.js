@@ -17,6 +17,7 @@ import { WatchList, watchOf } from "./watch.js";
  * @property {(enlarged: Tile | null) => void} onEnlarged
  * @property {(tile: Tile) => import("./painter.js").BlendOfTiles | null} blendOf
  * @property {(tile: Tile, ageMs: number) => void} onDrawn
+ * @property {() => boolean} isMeasured whether the numbers of the enlarged stream are shown
  * @property {() => Watch[] | null} watchInstead what a view that takes the place of the wall needs; `null` without one
  * @property {(stream: string, delivery: import("./slot.js").Delivery) => boolean} takeInstead takes an image for it
  */
@@ -141,7 +142,8 @@ export class Wall {
   }
 
   #watch() {
-    const shown = this.#options.watchInstead() ?? watchOf(this.tiles.values(), this.enlarged, this.#blend());
+    const wanted = () => watchOf(this.tiles.values(), this.enlarged, this.#blend(), this.#options.isMeasured());
+    const shown = this.#options.watchInstead() ?? wanted();
     const watched = document.hidden ? [] : shown;
     const now = performance.now();
     for (const stream of this.#watchList.ask(watched)) {

@@ -88,9 +88,9 @@ test("a table of rays has every step-th pixel of the full image, from the first"
 
 test("a pose turns and moves as its quaternion says, and its inverse undoes it", () => {
   const half = Math.SQRT1_2;
-  const quarterAboutZ = poseMatrix([half, 0, 0, half], [1, 2, 3]);
+  const quarterAboutZ = poseMatrix([0, 0, half, half], [1, 2, 3]);
   close(transform(quarterAboutZ, [1, 0, 0]), [1, 3, 3, 1], 1e-12);
-  const pose = poseMatrix([0.4, -0.3, 0.5, 0.7], [0.1, -0.2, 0.3]);
+  const pose = poseMatrix([-0.3, 0.5, 0.7, 0.4], [0.1, -0.2, 0.3]);
   const [x, y, z] = transform(pose, [0.7, 0.8, 0.9]);
   close(transform(inversePose(pose), [x, y, z]), [0.7, 0.8, 0.9, 1], 1e-12);
   close(multiply(pose, inversePose(pose)), [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], 1e-12);
@@ -133,7 +133,7 @@ test("a point under the pointer stays there when the scene is moved", () => {
 });
 
 test("home is behind and above the cameras and shows what they see", () => {
-  const ahead = poseMatrix([1, 0, 0, 0], [0, 0, 0]);
+  const ahead = poseMatrix([0, 0, 0, 1], [0, 0, 0]);
   const points = [[-0.5, 0, 2], [0.5, 0, 2], [0, 0.4, 2], [0, -0.4, 2], [0, 0, 2]];
   const from = home([ahead], points, [0, -1, 0]);
   close(from.target, [0, 0, 2], 1e-12);
@@ -144,24 +144,24 @@ test("home is behind and above the cameras and shows what they see", () => {
     assert.notEqual(placeOf(whole, point, { width: 160, height: 100 }), null, `${point}`);
   }
   // Two that look at each other, and see nothing.
-  const back = poseMatrix([0, 0, 1, 0], [0, 0, 3]);
+  const back = poseMatrix([0, 1, 0, 0], [0, 0, 3]);
   const between = home([ahead, back], [], [0, -1, 0]);
   close(between.target, [0, 0, 1.5], 1e-12);
 });
 
 test("up is where the upper edges of the images are", () => {
-  const ahead = poseMatrix([1, 0, 0, 0], [0, 0, 0]);
+  const ahead = poseMatrix([0, 0, 0, 1], [0, 0, 0]);
   assert.deepEqual(upOf([ahead]), [0, -1, 0]);
   // Optical axes along x, z of the mount up: what a robot's base is.
-  const robot = poseMatrix([0.5, -0.5, 0.5, -0.5], [0, 0, 0]);
+  const robot = poseMatrix([-0.5, 0.5, -0.5, 0.5], [0, 0, 0]);
   close(transform(robot, [0, 0, 1]), [1, 0, 0, 1], 1e-12);
   assert.deepEqual(upOf([robot]), [0, 0, 1]);
-  assert.deepEqual(upOf([ahead, poseMatrix([0, 0, 0, 1], [0, 0, 0])]), [0, -1, 0], "images that cancel each other");
+  assert.deepEqual(upOf([ahead, poseMatrix([0, 0, 1, 0], [0, 0, 0])]), [0, -1, 0], "images that cancel each other");
 });
 
 test("a frustum has the corners that the lens gives", () => {
   const intrinsics = { fx: 100, fy: 100, cx: 50, cy: 25, model: "none", coeffs: [] };
-  const lines = frustumLines(intrinsics, 101, 51, poseMatrix([1, 0, 0, 0], [1, 0, 0]), 2);
+  const lines = frustumLines(intrinsics, 101, 51, poseMatrix([0, 0, 0, 1], [1, 0, 0]), 2);
   assert.equal(lines.length % 6, 0);
   close(lines.slice(0, 6), [1, 0, 0, 0, -0.5, 2], 1e-12);
 });
@@ -177,7 +177,7 @@ test("the floor lies across up at its height, with round cells", () => {
 test("sampled points are where a slow model puts them, without holes", () => {
   const intrinsics = { fx: 100, fy: 100, cx: 1, cy: 1, model: "none", coeffs: [] };
   const depth = new Uint16Array([0, 1000, 2000, 0, 500, 0]);
-  const pose = poseMatrix([1, 0, 0, 0], [0, 0, 10]);
+  const pose = poseMatrix([0, 0, 0, 1], [0, 0, 10]);
   const samples = samplePoints(depth, rayTable(intrinsics, 3, 2, 1), 0.001, pose, 100);
   assert.equal(samples.length, 3);
   close(samples[1], [0.02, -0.02, 12], 1e-6);
