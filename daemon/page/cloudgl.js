@@ -1,9 +1,10 @@
 /** Draws points and lines with WebGL2. */
 
 import { FRAGMENT, LINES_VERTEX, POINTS_VERTEX } from "./cloudshaders.js";
+import { poseOf } from "./cloudscene.js";
 import { FARTHEST_X, turbo } from "./colormap.js";
 import { MODEL_CODES, coefficients, maxRadius, rayTable } from "./lens.js";
-import { inversePose, multiply, poseMatrix } from "./matrix.js";
+import { inversePose, multiply } from "./matrix.js";
 import { depthOf } from "./protocol.js";
 
 /** @typedef {import("./matrix.js").Matrix} Matrix */
@@ -44,11 +45,6 @@ const UNITS = { depth: 0, rays: 1, color: 2, turbo: 3 };
  * @property {CloudPoints[]} clouds
  * @property {{lines: number[], color: [number, number, number]}[]} lines
  */
-
-/** @param {Geometry} geometry */
-export function poseOf(geometry) {
-  return poseMatrix(geometry.rotation_xyzw, geometry.translation_m);
-}
 
 export class CloudRenderer {
   #gl;

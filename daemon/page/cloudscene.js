@@ -1,7 +1,7 @@
 /** What stands in the 3-D view beside the points: up, floor, frusta. Pure functions. */
 
 import { NO_RAY, unprojector } from "./lens.js";
-import { add, dot, rotate, scale, subtract, transform, unit } from "./matrix.js";
+import { add, dot, poseMatrix, rotate, scale, subtract, transform, unit } from "./matrix.js";
 
 /** @typedef {import("./matrix.js").Vector} Vector */
 /** @typedef {import("./matrix.js").Matrix} Matrix */
@@ -16,6 +16,16 @@ const CELLS_M = [0.05, 0.1, 0.2, 0.5, 1, 2, 5];
 export const AXES = {
   "x": [1, 0, 0], "-x": [-1, 0, 0], "y": [0, 1, 0], "-y": [0, -1, 0], "z": [0, 0, 1], "-z": [0, 0, -1],
 };
+
+/**
+ * From a stream's optical frame to the mount.
+ *
+ * @param {Geometry} geometry
+ * @returns {Matrix}
+ */
+export function poseOf(geometry) {
+  return poseMatrix(geometry.rotation_xyzw, geometry.translation_m);
+}
 
 /**
  * Up on the mount: where the upper edges of the images are, on the whole.

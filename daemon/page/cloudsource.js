@@ -1,7 +1,6 @@
 /** One depth stream of the 3-D view: its newest depth, the newest colour of its camera, and where both are. */
 
-import { samplePoints } from "./cloudscene.js";
-import { poseOf } from "./cloudgl.js";
+import { poseOf, samplePoints } from "./cloudscene.js";
 import { isKnown } from "./lens.js";
 import { depthOf } from "./protocol.js";
 import { ImageSlot } from "./slot.js";
@@ -52,8 +51,6 @@ export function sourcesOf(cameras, isDepth) {
 
 export class CloudSource {
   isShown = true;
-  /** Why its points cannot be placed; empty if they can. */
-  problem = "";
   isStale = false;
   isGone = false;
   #depthSlot;
@@ -110,16 +107,11 @@ export class CloudSource {
   }
 
   /**
-   * @param {string} stream
+   * @param {string} stream its depth or its colour
    * @param {import("./slot.js").Delivery} delivery
-   * @returns {boolean} whether it is one of its streams
    */
   accept(stream, delivery) {
-    if (!this.isShown || (stream !== this.id && stream !== this.colorId)) {
-      return false;
-    }
     (stream === this.id ? this.#depthSlot : this.#colorSlot).put(delivery);
-    return true;
   }
 
   /** Drops images that were not drawn. */

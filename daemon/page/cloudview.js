@@ -1,11 +1,13 @@
 /** The 3-D view: the fused points of all cameras, shown instead of the wall. */
 
-import { CloudRenderer, poseOf } from "./cloudgl.js";
+import { CloudBar } from "./cloudbar.js";
+import { CloudRenderer } from "./cloudgl.js";
+import { LOST, NO_WEBGL, cloudHint } from "./cloudhints.js";
 import { CloudInput } from "./cloudinput.js";
 import { CloudLabels } from "./cloudlabels.js";
-import { AXES, floorLines, frustumLines, upOf } from "./cloudscene.js";
+import { floorLines, frustumLines, poseOf, upOf } from "./cloudscene.js";
 import { CloudSource, TINTS, sourcesOf } from "./cloudsource.js";
-import { announce, byId, make, setText } from "./dom.js";
+import { announce, byId, setText } from "./dom.js";
 import { dot, multiply } from "./matrix.js";
 import { home, projectionMatrix, quantile, viewMatrix } from "./orbit.js";
 import { SMALL_WIDTH, Thinning, cloudWidth } from "./thinning.js";
@@ -16,7 +18,6 @@ import { periodMs } from "./tilestate.js";
 /** @typedef {import("./types.js").Geometry} Geometry */
 /** @typedef {import("./types.js").Watch} Watch */
 /** @typedef {import("./orbit.js").Orbit} Orbit */
-/** @typedef {import("./cloudgl.js").Paint} Paint */
 
 const FEW_CAMERAS = 4;
 const FEW_HZ = 10;
@@ -26,13 +27,6 @@ const SAMPLES = 400;
 const HOME_WAIT_MS = 1500;
 const FRUSTUM_SHARE = 0.16;
 const MOST_PIXEL_RATIO = 2;
-
-const NO_WEBGL =
-  "This browser gives the page no WebGL2, which the 3-D view needs. In Chrome or Chromium, switch on “Use graphics " +
-  "acceleration when available” in the settings, or start it with --enable-unsafe-swiftshader. The wall works without.";
-const LOST = "The graphics driver took the 3-D view away; it comes back by itself. If it does not, close and open it again.";
-const SAME_POSES =
-  "All cameras have the same pose, so that their points lie within each other. “depthrig calibrate” finds the poses.";
 
 /**
  * @typedef {Object} CloudOptions
@@ -48,13 +42,10 @@ export class CloudView {
   #section = byId("cloud", HTMLElement);
   #box = byId("cloud-box", HTMLElement);
   #canvas = byId("cloud-canvas", HTMLCanvasElement);
-  #cameras = byId("cloud-cameras", HTMLElement);
   #message = byId("cloud-message", HTMLElement);
   #facts = byId("cloud-facts", HTMLElement);
-  #paint = byId("cloud-paint", HTMLSelectElement);
-  #limit = byId("cloud-points", HTMLSelectElement);
-  #up = byId("cloud-up", HTMLSelectElement);
   #button = byId("show-cloud", HTMLButtonElement);
+  #bar;
   #labels = new CloudLabels(byId("cloud-labels", HTMLElement));
   #thinning = new Thinning();
   /** @type {CloudRenderer | null} */
@@ -109,7 +100,25 @@ export class CloudView {
         this.redraw();
       },
       reset: () => this.#reset(),
-      nextPaint: () => this.#nextPaint(),
+      nextPaint: () => {
+        announce(this.#bar.nextPaint());
+        this.redraw();
+      },
+    });
+    this.#bar = new CloudBar({
+      onPaint: () => this.redraw(),
+      onChosen: (source) => {
+        source.clear();
+        this.#options.askWatch();
+        this.redraw();
+      },
+      onLimit: () => {
+        this.#thinning.setLimit(this.#bar.limit);
+        this.#options.askWatch();
+        this.redraw();
+      },
+      onReset: () => this.#reset(),
+      onClose: () => this.close(),
     });
     this.#canvas.addEventListener("webglcontextlost", (event) => {
       event.preventDefault();
@@ -127,11 +136,6 @@ export class CloudView {
     new ResizeObserver(() => this.redraw()).observe(this.#box);
     document.addEventListener("visibilitychange", () => this.#sources.forEach((source) => source.clear()));
     this.#button.addEventListener("click", () => this.toggle());
-    byId("cloud-close", HTMLButtonElement).addEventListener("click", () => this.close());
-    byId("cloud-reset", HTMLButtonElement).addEventListener("click", () => this.#reset());
-    this.#paint.addEventListener("change", () => this.redraw());
-    this.#up.addEventListener("change", () => this.#reset());
-    this.#limit.addEventListener("change", () => this.#limitChanged());
   }
 
   toggle() {
@@ -195,7 +199,7 @@ export class CloudView {
         const first = this.#sources.find(({ camera }) => camera === source.camera);
         source.isShown = source === first;
       }
-      this.#offerCameras();
+      this.#bar.offer(this.#sources);
       this.#options.askWatch();
     }
   }
@@ -219,7 +223,7 @@ export class CloudView {
     }
     const shown = this.#sources.filter(({ isShown }) => isShown);
     const hz = shown.length <= FEW_CAMERAS ? FEW_HZ : MANY_HZ;
-    const width = cloudWidth(this.#limit.value === "auto" ? 0 : this.#thinning.limit, shown.length);
+    const width = cloudWidth(this.#bar.limit ?? 0, shown.length);
     const colors = new Set(shown.flatMap(({ colorId }) => colorId ?? []));
     return [
       ...shown.map(({ id }) => ({ stream: id, width, rate_hz: hz })),
@@ -236,8 +240,10 @@ export class CloudView {
     if (!this.isOpen || this.#renderer === null) {
       return false;
     }
-    const source = this.#sources.find((candidate) => candidate.isShown && (candidate.id === stream || candidate.colorId === stream));
-    return source?.accept(stream, delivery) ?? false;
+    const sources = this.#sources.filter(({ id, colorId, isShown }) => isShown && (id === stream || colorId === stream));
+    // A colour image may be for two depths of one camera; it has one credit.
+    sources.forEach((source, i) => source.accept(stream, i === 0 ? delivery : { ...delivery, credit: () => {} }));
+    return sources.length > 0;
   }
 
   #prepared() {
@@ -325,7 +331,7 @@ export class CloudView {
       scale: (projection[5] * height) / 2,
       range,
       isClipped: !isAutomatic,
-      paint: /** @type {Paint} */ (this.#paint.value),
+      paint: this.#bar.paint,
       clouds,
       lines: this.#lines(),
     });
@@ -401,73 +407,16 @@ export class CloudView {
     this.#isHomeDue = false;
     const poses = ready.map(({ geometry }) => poseOf(/** @type {Geometry} */ (geometry)));
     const samples = ready.flatMap((source) => source.samples(SAMPLES));
-    const up = AXES[this.#up.value] ?? upOf(poses);
+    const up = this.#bar.up ?? upOf(poses);
     this.#orbit = home(poses, samples, up);
     const heights = samples.length > 0 ? samples : [this.#orbit.target];
     this.#floor = quantile(heights.map((point) => dot(point, up)), 0.02);
   }
 
-  #nextPaint() {
-    this.#paint.selectedIndex = (this.#paint.selectedIndex + 1) % this.#paint.options.length;
-    announce(this.#paint.selectedOptions[0]?.text ?? "");
-    this.redraw();
-  }
-
-  #limitChanged() {
-    const { value } = this.#limit;
-    this.#thinning.setLimit(value === "auto" ? null : Number(value));
-    this.#options.askWatch();
-    this.redraw();
-  }
-
-  #offerCameras() {
-    const boxes = this.#sources.map((source) => {
-      const label = make("label", "check");
-      const box = document.createElement("input");
-      box.type = "checkbox";
-      box.checked = source.isShown;
-      box.addEventListener("change", () => {
-        source.isShown = box.checked;
-        source.clear();
-        this.#options.askWatch();
-        this.redraw();
-      });
-      const swatch = make("span", "swatch");
-      swatch.style.background = `rgb(${source.tint.map((part) => Math.round(part * 255)).join(" ")})`;
-      const name = document.createElement("span");
-      name.textContent = this.#nameOf(source);
-      label.append(box, swatch, name);
-      return label;
-    });
-    this.#cameras.replaceChildren(...boxes);
-  }
-
-  /** @param {CloudSource} source */
-  #nameOf(source) {
-    return this.#sources.filter(({ camera }) => camera === source.camera).length > 1 ? source.id : source.camera;
-  }
-
   #say() {
     if (this.isOpen) {
-      setText(this.#message, this.#isLost ? LOST : this.#hasNoWebgl ? NO_WEBGL : this.#hint());
+      const hint = cloudHint(this.#sources, (id) => this.#geometries.has(id));
+      setText(this.#message, this.#isLost ? LOST : this.#hasNoWebgl ? NO_WEBGL : hint);
     }
-  }
-
-  /** What the picture cannot show. */
-  #hint() {
-    const shown = this.#sources.filter(({ isShown }) => isShown);
-    if (shown.length === 0) {
-      return this.#sources.length === 0 ? "This rig has no depth stream." : "No camera is chosen.";
-    }
-    const unplaced = shown.filter(({ id, geometry }) => this.#geometries.has(id) && geometry === null);
-    if (unplaced.length > 0) {
-      const names = unplaced.map(({ id }) => id).join(", ");
-      return `${names}: the lens is not known, so that its points have no place. Give its intrinsics in the rig file.`;
-    }
-    const poses = this.#placed.map(({ geometry }) => JSON.stringify(poseOf(/** @type {Geometry} */ (geometry))));
-    const cameras = new Set(this.#placed.map(({ camera }) => camera));
-    return cameras.size > 1 && new Set(poses).size === 1 ? SAME_POSES : "";
   }
 }
-
-

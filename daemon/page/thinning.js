@@ -33,9 +33,6 @@ export class Thinning {
     this.#costs = [];
   }
 
-  get limit() {
-    return this.#limit;
-  }
 
   /**
    * @param {number} ms that a frame took

@@ -8,6 +8,7 @@ const { NO_RAY, maxRadius, project, rayTable, unprojector } = await load("lens.j
 const { eyeOf, home, panned, projectionMatrix, quantile, turned, viewMatrix, zoomed } = await load("orbit.js");
 const { FEWEST_POINTS, MOST_POINTS, TARGET_MS, Thinning, cloudWidth, thinGrid } = await load("thinning.js");
 const { floorLines, frustumLines, samplePoints, upOf } = await load("cloudscene.js");
+const { cloudHint } = await load("cloudhints.js");
 const { sourcesOf } = await load("cloudsource.js");
 const { movedByKey } = await load("cloudinput.js");
 const { placeOf } = await load("cloudlabels.js");
@@ -270,4 +271,18 @@ test("keys of the view turn, move and zoom; others are left alone", () => {
   assert.notDeepEqual(movedByKey(orbit, "ArrowUp", true).target, orbit.target);
   assert.ok(movedByKey(orbit, "+", true).distance < orbit.distance);
   assert.equal(movedByKey(orbit, "n", false), null);
+});
+
+test("the view says which cameras it cannot place, and that none was calibrated", () => {
+  const geometry = { rotation_xyzw: [0, 0, 0, 1], translation_m: [0, 0, 0] };
+  const source = (camera, more = {}) => ({ id: `${camera}/depth`, camera, isShown: true, geometry, ...more });
+  const all = () => true;
+  assert.match(cloudHint([], all), /no depth/);
+  assert.match(cloudHint([source("a", { isShown: false })], all), /No camera/);
+  assert.match(cloudHint([source("a"), source("b", { geometry: null })], all), /^b\/depth: .*intrinsics/);
+  assert.equal(cloudHint([source("a"), source("b", { geometry: null })], (id) => id === "a/depth"), "", "not yet known");
+  assert.match(cloudHint([source("a"), source("b")], all), /depthrig calibrate/);
+  assert.equal(cloudHint([source("a"), source("a", { id: "a/depth_refined" })], all), "", "of one camera");
+  const moved = { ...geometry, translation_m: [0.1, 0, 0] };
+  assert.equal(cloudHint([source("a"), source("b", { geometry: moved })], all), "");
 });

@@ -1,6 +1,6 @@
 """The 3-D view of the live page in a real browser: points are where the geometry says, in their colours.
 
-Where a point must appear is computed here from the matrix that the page says it used; the scene uses nothing of depthrig.
+Where a point must appear is computed here from the matrix that the page says it used; the scene has nothing of depthrig.
 """
 
 from __future__ import annotations
