@@ -1,7 +1,7 @@
 /** What an image shows of focus and exposure, pixel by pixel: pure functions. */
 
 /** A Laplacian of luma (4 neighbours, of 255 levels) above this is an edge in focus. */
-export const PEAKING_FROM = 48;
+export const PEAKING_FROM = 32;
 /** JPEG moves a white pixel by some levels. */
 export const BRIGHT_FROM = 250;
 export const DARK_TO = 4;

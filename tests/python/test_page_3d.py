@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from page import CHROMIUM, RIG, WAIT_MS, Address, Wall, address, files_camera, free_port, opened, until
+from page import CHROMIUM, RIG, Address, Wall, address, files_camera, free_port, opened, until
 from page_scene import BLUE, CAMERAS, FRONT, HALF_M, PLANE_M, RED, SIDE, SQUARE
 from PIL import Image
 from playwright.sync_api import Browser, sync_playwright
@@ -366,7 +366,7 @@ def test_a_camera_that_is_pulled_turns_grey_and_one_without_a_lens_is_named(
             wall.wait_for_image("pulled/depth")
             open_view(wall, 1)
             wall.wait_for("() => /blind\\/depth.*lens/.test(document.querySelector('#cloud-message').innerText)")
-            wall.page.wait_for_function("depthrig.view.stale.includes('pulled/depth')", timeout=WAIT_MS)
+            wall.wait_for("() => depthrig.view.stale.includes('pulled/depth')")
             wall.wait_for("() => /pulled: no image/.test(document.querySelector('#cloud-labels').innerText)")
             wall.page.wait_for_timeout(300)
             save_screenshot(wall, "cloud-pulled")
