@@ -14,6 +14,8 @@ import { depthOf } from "./protocol.js";
 const BACKGROUND = [0.047, 0.055, 0.067];
 const TURBO_STEPS = 256;
 const PAINTS = { color: 0, distance: 1, camera: 2 };
+/** Points without colour are drawn as if they were farther away by this share. */
+const BEHIND_SHARE = 0.03;
 const UNITS = { depth: 0, rays: 1, color: 2, turbo: 3 };
 
 /** @typedef {keyof typeof PAINTS} Paint */
@@ -38,7 +40,7 @@ const UNITS = { depth: 0, rays: 1, color: 2, turbo: 3 };
  *
  * @typedef {Object} Frame
  * @property {Matrix} viewProjection
- * @property {number} scale pixels of the screen that 1 m at 1 m covers
+ * @property {Matrix} projection
  * @property {{near: number, far: number}} range
  * @property {boolean} isClipped
  * @property {Paint} paint
@@ -172,6 +174,8 @@ export class CloudRenderer {
     gl.uniform1i(at("color_image"), UNITS.color);
     gl.uniform1i(at("turbo"), UNITS.turbo);
     gl.uniformMatrix4fv(at("view_projection"), false, frame.viewProjection);
+    const { projection } = frame;
+    gl.uniform1f(at("behind"), -BEHIND_SHARE * projection[14]);
     gl.uniform2f(at("range"), frame.range.near, frame.range.far);
     gl.uniform1i(at("is_clipped"), Number(frame.isClipped));
     gl.uniform1i(at("paint"), PAINTS[frame.paint]);
@@ -183,7 +187,7 @@ export class CloudRenderer {
       gl.uniform2i(at("grid"), cloud.grid.columns, cloud.grid.rows);
       gl.uniform1f(at("unit_m"), cloud.unitM);
       gl.uniformMatrix4fv(at("pose"), false, pose);
-      gl.uniform1f(at("pixel_size"), apart * frame.scale);
+      gl.uniform1f(at("pixel_size"), (apart * projection[5] * gl.drawingBufferHeight) / 2);
       gl.uniform3fv(at("tint"), cloud.tint);
       gl.uniform1i(at("is_stale"), Number(cloud.isStale));
       this.#setColor(at, cloud.color, pose);

@@ -5,6 +5,9 @@ import { transform } from "./matrix.js";
 
 /** @typedef {import("./cloudsource.js").CloudSource} CloudSource */
 
+/** A name below its camera stays in the view. */
+const LABEL_PX = 34;
+
 /**
  * Where a point is in the view; `null` if it is behind the eye or out of sight.
  *
@@ -53,7 +56,7 @@ export class CloudLabels {
       setText(label, source.isStale || source.isGone ? `${source.camera}: no image` : source.camera);
       if (place !== null) {
         label.style.left = `${place.x}px`;
-        label.style.top = `${place.y}px`;
+        label.style.top = `${Math.min(place.y, size.height - LABEL_PX)}px`;
       }
     }
   }

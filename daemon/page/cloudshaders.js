@@ -15,6 +15,7 @@ uniform float unit_m;
 uniform mat4 pose;             // of the depth camera on the mount
 uniform mat4 view_projection;
 uniform float pixel_size;      // what a point at 1 m covers at 1 m, pixels of the screen
+uniform float behind;          // what brings a point a little behind others at its distance
 uniform vec2 range;            // near and far, metres
 uniform bool is_clipped;
 uniform int paint;             // 0 colour, 1 distance, 2 camera
@@ -51,6 +52,9 @@ vec3 by_distance(float z) {
   return textureLod(turbo, vec2(clamp(x, 0.0, 1.0) * 255.0 / 256.0 + 0.5 / 256.0, 0.5), 0.0).rgb;
 }
 
+// Grey where the colour camera does not look.
+const vec3 UNSEEN = vec3(0.5);
+
 vec3 by_camera(vec3 point, float z) {
   vec3 seen = (to_color * vec4(point, 1.0)).xyz;
   vec2 p = seen.xy / seen.z;
@@ -60,9 +64,9 @@ vec3 by_camera(vec3 point, float z) {
     if (all(greaterThanEqual(at, vec2(0.0))) && all(lessThanEqual(at, vec2(1.0)))) {
       return textureLod(color_image, at, 0.0).rgb;
     }
-    return vec3(0.5);
+    return UNSEEN;
   }
-  return has_color ? vec3(0.5) : by_distance(z);
+  return has_color ? UNSEEN : by_distance(z);
 }
 
 void main() {
@@ -85,6 +89,8 @@ void main() {
     color = by_distance(z);
   } else {
     color = by_camera(point, z);
+    // Another camera may show the same surface in its colour.
+    gl_Position.z += color == UNSEEN ? behind : 0.0;
     if (paint == 2) {
       color = tint * (0.45 + 0.55 * dot(color, vec3(0.299, 0.587, 0.114)));
     }

@@ -50,7 +50,8 @@ export class CloudView {
   #thinning = new Thinning();
   /** @type {CloudRenderer | null} */
   #renderer = null;
-  #hasNoWebgl = false;
+  /** Why nothing can be drawn; empty if it can. */
+  #failure = "";
   #isLost = false;
   /** @type {ReadonlyMap<string, Geometry>} by stream */
   #geometries;
@@ -180,8 +181,12 @@ export class CloudView {
       return;
     }
     const gl = this.#canvas.getContext("webgl2", { alpha: false, antialias: false });
-    this.#hasNoWebgl = gl === null;
-    this.#renderer = gl === null ? null : new CloudRenderer(gl);
+    this.#failure = gl === null ? NO_WEBGL : "";
+    try {
+      this.#renderer = gl === null ? null : new CloudRenderer(gl);
+    } catch (error) {
+      this.#failure = error instanceof Error ? error.message : String(error);
+    }
     this.#say();
   }
 
@@ -218,7 +223,7 @@ export class CloudView {
     if (!this.isOpen) {
       return null;
     }
-    if (this.#hasNoWebgl) {
+    if (this.#failure !== "") {
       return [];
     }
     const shown = this.#sources.filter(({ isShown }) => isShown);
@@ -328,7 +333,7 @@ export class CloudView {
     const { range, isAutomatic } = this.#options.range();
     renderer.draw({
       viewProjection,
-      scale: (projection[5] * height) / 2,
+      projection,
       range,
       isClipped: !isAutomatic,
       paint: this.#bar.paint,
@@ -416,7 +421,7 @@ export class CloudView {
   #say() {
     if (this.isOpen) {
       const hint = cloudHint(this.#sources, (id) => this.#geometries.has(id));
-      setText(this.#message, this.#isLost ? LOST : this.#hasNoWebgl ? NO_WEBGL : hint);
+      setText(this.#message, this.#isLost ? LOST : this.#failure || hint);
     }
   }
 }

@@ -23,7 +23,7 @@ const FARTHEST_M = 100;
 const HOME_PITCH = (24 * Math.PI) / 180;
 /** A little from the side, so that the lines of sight have a length. */
 const HOME_YAW = (20 * Math.PI) / 180;
-const HOME_MARGIN = 0.85;
+const HOME_MARGIN = 0.95;
 /** Without depth, cameras are taken to see so far. */
 const BLIND_M = 1.5;
 

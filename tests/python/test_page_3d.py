@@ -237,7 +237,19 @@ def test_keys_and_mouse_turn_move_and_zoom_and_reset_goes_back(wall: Wall) -> No
         wall.page.mouse.wheel(0, 200)
 
     press = wall.page.keyboard.press
-    moves = [drag, wheel, *(lambda k=k: press(k) for k in ("ArrowLeft", "Shift+ArrowUp", "-"))]
+    touches = wall.page.context.new_cdp_session(wall.page)
+
+    def pinch() -> None:
+        def touch(kind: str, apart: int) -> None:
+            points = [{"x": middle[0] + side * apart, "y": middle[1], "id": side} for side in (0, 1)] if apart else []
+            touches.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+        touch("touchStart", 100)
+        for apart in (120, 140, 160):
+            touch("touchMove", apart)
+        touch("touchEnd", 0)
+
+    moves = [drag, wheel, pinch, *(lambda k=k: press(k) for k in ("ArrowLeft", "Shift+ArrowUp", "-"))]
     for move in moves:
         move()
         until(lambda: not np.allclose(matrix(wall), home, atol=1e-3))
