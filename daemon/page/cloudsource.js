@@ -12,11 +12,11 @@ import { thinGrid } from "./thinning.js";
 /** @typedef {import("./slot.js").Prepared} Prepared */
 
 /**
- * So long after an image was due, the points turn grey; much later they go. A computer that draws with its CPU takes
- * images slower than they are made, so that this is longer than on the wall; a camera that is lost is grey at once.
+ * Points without a newer image turn grey after so long, though their camera works: a computer that draws with its CPU
+ * takes images slower than they are made. Those of a camera that is lost turn grey at once and go later.
  */
-const STALE_MS = 1000;
-const GONE_MS = 5000;
+const STALE_MS = 4000;
+const GONE_MS = 8000;
 
 /** @type {[number, number, number][]} as far apart as can be, and none of them grey */
 export const TINTS = [
@@ -167,16 +167,14 @@ export class CloudSource {
   /**
    * Follows its camera and the clock.
    *
-   * @param {CameraStatus | undefined} camera
+   * @param {boolean} isLost whether its camera has no images
    * @param {number} now ms
-   * @param {number} periodMs between images
    * @param {boolean} isPaused whether a replay waits
    * @returns {boolean} whether anything changed
    */
-  follow(camera, now, periodMs, isPaused) {
-    const isLost = camera === undefined || camera.state !== "streaming";
+  follow(isLost, now, isPaused) {
     const since = now - this.#arrivedAt;
-    const isStale = this.#depth !== null && !isPaused && (isLost || since > STALE_MS + periodMs);
+    const isStale = this.#depth !== null && !isPaused && (isLost || since > STALE_MS);
     const isGone = this.#depth === null || (isStale && since > GONE_MS);
     const hasChanged = isStale !== this.isStale || isGone !== this.isGone;
     this.isStale = isStale;

@@ -12,7 +12,7 @@ import { dot, multiply } from "./matrix.js";
 import { home, projectionMatrix, quantile, viewMatrix } from "./orbit.js";
 import { SMALL_WIDTH, Thinning, cloudWidth } from "./thinning.js";
 import { isDepthFormat } from "./tile.js";
-import { periodMs } from "./tilestate.js";
+import { STALE_MS, periodMs } from "./tilestate.js";
 
 /** @typedef {import("./types.js").Status} Status */
 /** @typedef {import("./types.js").Geometry} Geometry */
@@ -33,7 +33,7 @@ const MOST_PIXEL_RATIO = 2;
  * @property {() => void} askWatch
  * @property {ReadonlyMap<string, Geometry>} geometries by stream
  * @property {() => {range: import("./colormap.js").Range, isAutomatic: boolean}} range
- * @property {() => {isPaused: boolean, fastestHz: number}} replay
+ * @property {() => {isLive: boolean, isPaused: boolean, fastestHz: number}} state of the connection, and of a replay
  * @property {(isOpen: boolean) => void} onToggled
  */
 
@@ -52,7 +52,7 @@ export class CloudView {
   #renderer = null;
   /** Why nothing can be drawn; empty if it can. */
   #failure = "";
-  #isLost = false;
+  #isContextLost = false;
   /** @type {ReadonlyMap<string, Geometry>} by stream */
   #geometries;
   /** @type {CloudSource[]} */
@@ -123,14 +123,14 @@ export class CloudView {
     });
     this.#canvas.addEventListener("webglcontextlost", (event) => {
       event.preventDefault();
-      this.#isLost = true;
+      this.#isContextLost = true;
       this.#renderer = null;
       this.#drawing = null;
       this.#sources.forEach((source) => source.release(null));
       this.#say();
     });
     this.#canvas.addEventListener("webglcontextrestored", () => {
-      this.#isLost = false;
+      this.#isContextLost = false;
       this.#createRenderer();
       this.redraw();
     });
@@ -177,7 +177,7 @@ export class CloudView {
   }
 
   #createRenderer() {
-    if (this.#renderer !== null || this.#isLost) {
+    if (this.#renderer !== null || this.#isContextLost) {
       return;
     }
     const gl = this.#canvas.getContext("webgl2", { alpha: false, antialias: false });
@@ -264,16 +264,28 @@ export class CloudView {
     if (!this.isOpen) {
       return;
     }
-    const { isPaused, fastestHz } = this.#options.replay();
-    const hz = Math.min(MANY_HZ, fastestHz);
+    const { isLive, isPaused } = this.#options.state();
     for (const source of this.#sources) {
-      const camera = this.#status?.cameras.find(({ name }) => name === source.camera);
-      const nominal = camera?.streams.find(({ id }) => id === source.id)?.nominal_hz ?? 0;
-      if (source.follow(camera, now, periodMs(hz, nominal), isPaused)) {
+      if (source.follow(!isLive || this.#isLost(source), now, isPaused)) {
         this.redraw();
       }
     }
     this.#say();
+  }
+
+  /**
+   * Whether the daemon says that the camera has no images.
+   *
+   * @param {CloudSource} source
+   */
+  #isLost(source) {
+    const camera = this.#status?.cameras.find(({ name }) => name === source.camera);
+    const stream = camera?.streams.find(({ id }) => id === source.id);
+    if (camera?.state !== "streaming" || stream === undefined) {
+      return true;
+    }
+    const hz = Math.min(MANY_HZ, this.#options.state().fastestHz);
+    return (stream.last_frame_age_ms ?? 0) > STALE_MS + periodMs(hz, stream.nominal_hz);
   }
 
   redraw() {
@@ -421,7 +433,7 @@ export class CloudView {
   #say() {
     if (this.isOpen) {
       const hint = cloudHint(this.#sources, (id) => this.#geometries.has(id));
-      setText(this.#message, this.#isLost ? LOST : this.#failure || hint);
+      setText(this.#message, this.#isContextLost ? LOST : this.#failure || hint);
     }
   }
 }

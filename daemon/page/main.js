@@ -73,7 +73,8 @@ const cloud = new CloudView({
   askWatch: () => wall.askWatch(),
   geometries,
   range: () => range.current,
-  replay: () => ({
+  state: () => ({
+    isLive: connection.isLive,
     isPaused: replayBar.isShown && replayBar.isWaiting,
     fastestHz: replayBar.isShown ? replayBar.fastestHz : Infinity,
   }),
