@@ -13,7 +13,7 @@ export const DEPTH_VALUES = 65536;
 export const HOLE_COLOR = "#26282c";
 
 /** The far end of turbo is nearly black and would look like a hole. */
-const FARTHEST_X = 0.05;
+export const FARTHEST_X = 0.05;
 
 export const NEAREST_M = 0.05;
 export const MIN_SPAN_M = 0.05;

@@ -7,6 +7,8 @@ import { creditMessage, pixelMessage, tokenMessage, watchMessage } from "./proto
 /** @typedef {import("./types.js").Status} Status */
 /** @typedef {import("./types.js").Image} Image */
 /** @typedef {import("./types.js").PixelAnswer} PixelAnswer */
+/** @typedef {import("./types.js").Geometry} Geometry */
+/** @typedef {import("./types.js").Measure} Measure */
 /** @typedef {"connecting" | "live" | "lost" | "denied"} ConnectionState */
 
 /**
@@ -16,6 +18,8 @@ import { creditMessage, pixelMessage, tokenMessage, watchMessage } from "./proto
  * @property {(status: Status) => void} onStatus
  * @property {(image: Image, credit: () => void) => void} onImage `credit` must be called once, drawn or ignored
  * @property {(answer: PixelAnswer) => void} onPixel
+ * @property {(geometry: Geometry) => void} onGeometry
+ * @property {(measure: Measure) => void} onMeasure
  * @property {(message: string) => void} onProblem
  */
 
@@ -134,6 +138,10 @@ export class Connection {
       this.#listener.onStatus(message.status);
     } else if ("pixel" in message) {
       this.#listener.onPixel(message.pixel);
+    } else if ("geometry" in message) {
+      this.#listener.onGeometry(message.geometry);
+    } else if ("measure" in message) {
+      this.#listener.onMeasure(message.measure);
     } else {
       this.#listener.onProblem(message.problem.message);
     }

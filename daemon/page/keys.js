@@ -8,7 +8,7 @@
  * @property {boolean} takesArrows arrows move it
  * @property {boolean} isInDialog
  *
- * @typedef {{action: "toggleRecord" | "note" | "back" | "help" | "enlarge" | "playPause"}
+ * @typedef {{action: "toggleRecord" | "note" | "back" | "help" | "enlarge" | "playPause" | "cloud" | "aids"}
  *   | {action: "step", sets: number} | {action: "camera", n: number}} KeyAction
  */
 
@@ -67,6 +67,12 @@ export function actionOf(event, target) {
       return { action: "back" };
     case "?":
       return { action: "help" };
+    case "v":
+    case "V":
+      return { action: "cloud" };
+    case "a":
+    case "A":
+      return { action: "aids" };
     case "n":
     case "N":
       return { action: "note" };

@@ -1,7 +1,9 @@
 /** Puts the page together. */
 
+import { Aids } from "./aids.js";
 import { takeToken } from "./api.js";
 import { Blend } from "./blend.js";
+import { CloudView } from "./cloudview.js";
 import { Connection } from "./connection.js";
 import { announce, byId, releaseFocusAfterClicks, setState, setText } from "./dom.js";
 import { Hover } from "./hover.js";
@@ -32,7 +34,13 @@ Object.assign(window, { depthrig: debug });
 /** @type {Status | null} */
 let status = null;
 
-const range = new DepthRange(() => wall.redrawAll((tile) => tile.isDepth || tile === wall.enlarged));
+/** @type {Map<string, import("./types.js").Geometry>} by stream */
+const geometries = new Map();
+
+const range = new DepthRange(() => {
+  wall.redrawAll((tile) => tile.isDepth || tile === wall.enlarged);
+  cloud.redraw();
+});
 const blend = new Blend(() => {
   wall.redrawAll((tile) => tile === wall.enlarged);
   wall.askWatch();
@@ -42,6 +50,7 @@ const wall = new Wall({
   tables: range.tables,
   onEnlarged: (tile) => {
     blend.enlarged(wall.tiles.values(), tile);
+    aids.enlarged(tile);
     // Marks were set for tiles of another size.
     hover.hide();
   },
@@ -53,8 +62,28 @@ const wall = new Wall({
       debug.ages.shift();
     }
     labels.drawn(tile, ageMs);
+    aids.drawn(tile);
+  },
+  isMeasured: () => aids.isShown,
+  watchInstead: () => cloud.watch(),
+  takeInstead: (stream, delivery) => cloud.accept(stream, delivery),
+});
+const aids = new Aids({ askWatch: () => wall.askWatch(), geometries });
+const cloud = new CloudView({
+  askWatch: () => wall.askWatch(),
+  geometries,
+  range: () => range.current,
+  state: () => ({
+    isLive: connection.isLive,
+    isPaused: replayBar.isShown && replayBar.isWaiting,
+    fastestHz: replayBar.isShown ? replayBar.fastestHz : Infinity,
+  }),
+  onToggled: (isOpen) => {
+    byId("wall", HTMLElement).hidden = isOpen;
+    hover.hide();
   },
 });
+Object.assign(debug, { view: cloud.facts, aids });
 const labels = new TileLabels(wall);
 const hover = new Hover(wall.tiles, (id, place) => connection.askPixel(id, place));
 const recordBar = new RecordBar();
@@ -66,6 +95,11 @@ const connection = new Connection({
   onStatus: showStatus,
   onImage: (image, credit) => wall.accept(image, credit),
   onPixel: (answer) => hover.answer(answer),
+  onGeometry: (geometry) => {
+    geometries.set(geometry.stream, geometry);
+    cloud.redraw();
+  },
+  onMeasure: (measure) => aids.measured(measure),
   onProblem: showProblem,
 });
 
@@ -107,6 +141,7 @@ function showStatus(next) {
   soundForCameras(next);
   status = next;
   wall.build(next.cameras);
+  cloud.update(next);
   for (const camera of next.cameras) {
     for (const stream of camera.streams) {
       const tile = wall.tiles.get(stream.id);
@@ -155,7 +190,8 @@ function showTiles() {
   if (document.hidden || status === null) {
     return;
   }
-  range.follow(wall.tiles.values(), now);
+  range.follow(cloud.isOpen ? cloud.sources : wall.tiles.values(), now);
+  cloud.tick(now);
   const facts = {
     cameras: status.cameras,
     isLive: connection.isLive,
@@ -175,10 +211,15 @@ function act(action) {
     case "note":
       return recordBar.focusNotes();
     case "back":
-      return wall.enlarge(null);
+      return cloud.isOpen ? cloud.close() : wall.enlarge(null);
     case "help":
       return byId("help", HTMLDialogElement).showModal();
+    case "cloud":
+      return cloud.toggle();
+    case "aids":
+      return showAids();
     case "camera":
+      cloud.close();
       return wall.enlargeCamera(action.n);
     case "enlarge": {
       const focused = document.activeElement;
@@ -190,6 +231,26 @@ function act(action) {
       return replayBar.isShown ? replayBar.togglePause() : undefined;
     case "step":
       return replayBar.isShown ? replayBar.step(action.sets) : undefined;
+  }
+}
+
+/** Aids go with an enlarged image: without one, the tile that has the focus or the first is enlarged. */
+function showAids() {
+  if (cloud.isOpen) {
+    return;
+  }
+  if (wall.enlarged !== null) {
+    aids.toggle();
+    return;
+  }
+  const focused = document.activeElement;
+  const id = focused instanceof HTMLElement ? focused.dataset.stream : undefined;
+  const tile = wall.tiles.get(id ?? "") ?? [...wall.tiles.values()][0];
+  if (tile !== undefined) {
+    wall.enlarge(tile);
+    if (!aids.isOpen) {
+      aids.toggle();
+    }
   }
 }
 

@@ -5,6 +5,8 @@
 /** @typedef {import("./types.js").PixelAnswer} PixelAnswer */
 /** @typedef {import("./types.js").Hello} Hello */
 /** @typedef {import("./types.js").Status} Status */
+/** @typedef {import("./types.js").Geometry} Geometry */
+/** @typedef {import("./types.js").Measure} Measure */
 
 export const PROTOCOL = 1;
 export const HEAD_BYTES = 48;
@@ -23,6 +25,7 @@ const KIND_JPEG = 1;
 const KIND_DEPTH = 2;
 const BYTES_PER_DEPTH = 2;
 const NS_PER_MS = 1e6;
+const KNOWN = ["hello", "status", "pixel", "problem", "geometry", "measure"];
 
 /**
  * Reads a binary message.
@@ -87,7 +90,8 @@ export function jpegOf(image) {
 }
 
 /**
- * @typedef {{hello: Hello} | {status: Status} | {pixel: PixelAnswer} | {problem: {message: string}}} ServerMessage
+ * @typedef {{hello: Hello} | {status: Status} | {pixel: PixelAnswer} | {problem: {message: string}}
+ *   | {geometry: Geometry} | {measure: Measure}} ServerMessage
  */
 
 /**
@@ -102,8 +106,7 @@ export function parseText(text) {
   if (typeof message !== "object" || message === null) {
     return null;
   }
-  const isKnown = "hello" in message || "status" in message || "pixel" in message || "problem" in message;
-  return isKnown ? /** @type {ServerMessage} */ (message) : null;
+  return KNOWN.some((key) => key in message) ? /** @type {ServerMessage} */ (message) : null;
 }
 
 /** @param {string} token */

@@ -51,10 +51,14 @@ export class DepthRange {
     return table;
   };
 
+  get current() {
+    return { range: this.#range, isAutomatic: this.#auto.checked };
+  }
+
   /**
    * Follows what is shown, if automatic.
    *
-   * @param {Iterable<import("./tile.js").Tile>} tiles
+   * @param {Iterable<{shown: {image: import("./types.js").Image} | null, isOnScreen: boolean}>} tiles
    * @param {number} now ms
    */
   follow(tiles, now) {

@@ -174,6 +174,11 @@ export class Tile {
 
   /** Where the image lies in the view. */
   get imageRect() {
+    if (this.element.classList.contains("own-size")) {
+      const { offsetLeft, offsetTop, offsetWidth, offsetHeight } = this.canvas;
+      const { scrollLeft, scrollTop } = this.view;
+      return { left: offsetLeft - scrollLeft, top: offsetTop - scrollTop, width: offsetWidth, height: offsetHeight };
+    }
     const box = { width: this.view.clientWidth, height: this.view.clientHeight };
     return imageRect(box, this.fullSize.columns, this.fullSize.rows);
   }
@@ -190,8 +195,8 @@ export class Tile {
     for (const pixel of pixels) {
       const mark = make("span", "mark");
       const point = pointOver(pixel, this.imageRect, this.fullSize.columns, this.fullSize.rows);
-      mark.style.left = `${point.x}px`;
-      mark.style.top = `${point.y}px`;
+      mark.style.left = `${point.x + this.view.scrollLeft}px`;
+      mark.style.top = `${point.y + this.view.scrollTop}px`;
       this.view.append(mark);
     }
   }

@@ -70,7 +70,33 @@
  * @property {string} rig
  * @property {boolean} is_replay
  *
- * @typedef {{stream: string, width: number, rate_hz: number}} Watch
+ * @typedef {{stream: string, width: number, rate_hz: number, measure?: boolean}} Watch
+ *
+ * @typedef {Object} Intrinsics of the full image, pixels; the centre of the first pixel is (0, 0)
+ * @property {number} fx
+ * @property {number} fy
+ * @property {number} cx
+ * @property {number} cy
+ * @property {string} model
+ * @property {number[]} coeffs
+ *
+ * @typedef {Object} Geometry of a stream's full images
+ * @property {string} stream
+ * @property {number} width
+ * @property {number} height
+ * @property {number} depth_unit_m
+ * @property {Intrinsics} intrinsics
+ * @property {[number, number, number]} translation_m of the optical frame on the mount
+ * @property {[number, number, number, number]} rotation_xyzw
+ *
+ * @typedef {Object} Measure of a full image
+ * @property {string} stream
+ * @property {number} sequence
+ * @property {number | null} sharpness mean square of the Laplacian of luma; `null` for depth
+ * @property {number[] | null} luma 64 shares, dark first; `null` for depth
+ * @property {number | null} dark share of pixels that are black
+ * @property {number | null} bright share of pixels that are white
+ * @property {number | null} holes share of pixels without depth; `null` for other images
  *
  * @typedef {{stream: string, x: number, y: number}} Place
  *

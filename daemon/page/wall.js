@@ -17,6 +17,9 @@ import { WatchList, watchOf } from "./watch.js";
  * @property {(enlarged: Tile | null) => void} onEnlarged
  * @property {(tile: Tile) => import("./painter.js").BlendOfTiles | null} blendOf
  * @property {(tile: Tile, ageMs: number) => void} onDrawn
+ * @property {() => boolean} isMeasured whether the numbers of the enlarged stream are shown
+ * @property {() => Watch[] | null} watchInstead what a view that takes the place of the wall needs; `null` without one
+ * @property {(stream: string, delivery: import("./slot.js").Delivery) => boolean} takeInstead takes an image for it
  */
 
 export class Wall {
@@ -106,12 +109,16 @@ export class Wall {
    */
   accept(image, credit) {
     const stream = document.hidden ? null : this.#watchList.streamOf(image);
+    const delivery = { image, receivedAt: performance.now(), credit };
+    if (stream !== null && this.#options.takeInstead(stream, delivery)) {
+      return;
+    }
     const tile = this.tiles.get(stream ?? "");
     if (tile === undefined) {
       credit();
       return;
     }
-    tile.accept({ image, receivedAt: performance.now(), credit });
+    tile.accept(delivery);
   }
 
   /** Forgets what was asked of an earlier connection and asks again. */
@@ -135,7 +142,9 @@ export class Wall {
   }
 
   #watch() {
-    const watched = document.hidden ? [] : watchOf(this.tiles.values(), this.enlarged, this.#blend());
+    const wanted = () => watchOf(this.tiles.values(), this.enlarged, this.#blend(), this.#options.isMeasured());
+    const shown = this.#options.watchInstead() ?? wanted();
+    const watched = document.hidden ? [] : shown;
     const now = performance.now();
     for (const stream of this.#watchList.ask(watched)) {
       const tile = this.tiles.get(stream);

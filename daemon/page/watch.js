@@ -15,15 +15,17 @@ export const FULL_WIDTH = 0;
  * @param {Iterable<T>} tiles
  * @param {T | null} enlarged
  * @param {{below: T, above: T} | null} blend what the enlarged image is blended of
+ * @param {boolean} [isMeasured] whether the numbers of the enlarged stream are shown
  * @returns {Watch[]}
  */
-export function watchOf(tiles, enlarged, blend) {
+export function watchOf(tiles, enlarged, blend, isMeasured = false) {
   /** @type {Watch[]} */
   const watched = [];
   for (const tile of tiles) {
     const isFull = tile === enlarged || tile === blend?.below || tile === blend?.above;
     if (isFull) {
-      watched.push({ stream: tile.id, width: FULL_WIDTH, rate_hz: WALL_HZ });
+      const measured = isMeasured && tile === enlarged ? { measure: true } : {};
+      watched.push({ stream: tile.id, width: FULL_WIDTH, rate_hz: WALL_HZ, ...measured });
     } else if (tile.isOnScreen) {
       const width = enlarged === null ? WALL_WIDTH : STRIP_WIDTH;
       const rate = enlarged === null ? WALL_HZ : STRIP_HZ;
