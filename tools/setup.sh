@@ -60,6 +60,8 @@ for part in "$@"; do
         need g++ command -v c++
         # Inspects the dependencies of a program.
         need binutils command -v objdump
+        # Decodes the sixel images of `top`.
+        need libsixel-bin command -v sixel2png
         # The browser that the live page is tested in.
         need chromium command -v chromium
         # The boxes that tests run in.

@@ -94,9 +94,9 @@ test("a recording whose time stands still is being closed by somebody else", () 
 test("losses count from the start of the recording, and are new once", () => {
   const watch = new RecordingWatch();
   assert.equal(watch.follow(status(0, recording({ duration_s: 0 }), { no_slot: 7 }), false).hasNewLosses, false);
-  const facts = watch.follow(status(1, recording({ duration_s: 1 }), { no_slot: 9 }), false);
-  assert.deepEqual(facts.frames, { no_slot: 2 });
-  assert.equal(facts.hasNewLosses, true);
+  const later = watch.follow(status(1, recording({ duration_s: 1 }), { no_slot: 9 }), false);
+  assert.deepEqual(later.frames, { no_slot: 2 });
+  assert.equal(later.hasNewLosses, true);
   assert.equal(watch.follow(status(2, recording({ duration_s: 2 }), { no_slot: 9 }), false).hasNewLosses, false);
 });
 
