@@ -31,7 +31,7 @@ pub trait Control: Send + Sync {
     fn recordings(&self) -> Result<PathBuf> {
         Err(Error::new(ErrorKind::WrongState, "this rig replays datasets and has no folder of recordings"))
     }
-    /// What shows datasets beside the rig, if anything does.
+    /// Shows datasets beside the rig, if it can.
     fn shows(&self) -> Option<&dyn Shows> {
         None
     }
@@ -65,7 +65,7 @@ pub trait Control: Send + Sync {
     fn revert_controls(&self, _camera: &str) -> Result<CameraControls> {
         Err(no_controls())
     }
-    /// What writing the changed controls into the rig file would change.
+    /// Previews how the rig file changes when the changed controls are written into it.
     ///
     /// # Errors
     /// `WrongState` for a rig without a file, `Other` when it cannot be read or edited as text.
@@ -125,7 +125,7 @@ pub struct ControlList {
 pub struct CameraControls {
     /// Its name.
     pub camera: String,
-    /// Why there are none.
+    /// Why it has no controls.
     pub problem: Option<String>,
     /// Those that can be changed while it streams.
     pub controls: Vec<ControlInfo>,

@@ -68,7 +68,7 @@ pub struct Examined {
     /// The findings.
     #[serde(flatten)]
     pub report: Report,
-    /// What is attached, of the rig or not.
+    /// Everything attached, of the rig or not.
     pub attached: Attached,
 }
 

@@ -82,7 +82,7 @@ pub struct RigOptions {
     /// Source of refiners; tests put something that fails or hangs here. The engines and models of this
     /// computer when `None`.
     pub refiners: Option<Arc<dyn Refiners>>,
-    /// What shows datasets on the live page; none does when `None`.
+    /// Shows datasets on the live page; without it the page has the cameras alone.
     pub shows: Option<Arc<dyn Shows>>,
     /// Simulated cameras stream before their scenes are rendered, with coarse images until then.
     pub draw_while_running: bool,

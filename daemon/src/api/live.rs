@@ -90,7 +90,7 @@ impl Steer {
     }
 }
 
-/// What a page asks for with its address.
+/// Options in a page's address.
 #[derive(Debug, Default, Deserialize)]
 pub(super) struct Asked {
     /// A recording to show in place of the cameras, as the list of recordings names it.
@@ -206,7 +206,7 @@ async fn begin(
     Ok(Client { place, messages, view })
 }
 
-/// What a page shows: the rig, or one of its recordings.
+/// The source of a page's images: the rig, or one of its recordings.
 struct View {
     rig: Arc<dyn Control>,
     viewers: Viewers,
@@ -328,7 +328,7 @@ impl Client {
     }
 }
 
-/// What became of a client's message.
+/// Effect of a client's message.
 enum Done {
     Quietly,
     /// The status has changed.

@@ -48,14 +48,14 @@ pub struct Recordings {
 /// A recording.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Recording {
-    /// What it says of itself. `name` is the path of its folder below that of the recordings.
+    /// Its entry in the catalog. `name` is the path of its folder below that of the recordings.
     #[serde(flatten)]
     pub entry: CatalogEntry,
     /// Whether it has a report.
     pub has_report: bool,
 }
 
-/// The recording that is meant.
+/// A recording by its name.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct NameRequest {

@@ -40,7 +40,7 @@ pub struct LoopRequest {
     pub on: bool,
 }
 
-/// The camera that is meant.
+/// A camera by its name.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CameraRequest {
@@ -48,10 +48,10 @@ pub struct CameraRequest {
     pub camera: String,
 }
 
-/// The change that is meant.
+/// A change by its fingerprint.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FingerprintRequest {
-    /// What the changes of controls said.
+    /// That of the changes of controls.
     pub fingerprint: String,
 }

@@ -47,7 +47,7 @@ struct Worker {
 
 /// Numbers of a stream's frame.
 struct Numbers {
-    /// When they may be measured anew.
+    /// Earliest time of the next measurement.
     due: HostTime,
     /// `None` if it could not be measured.
     measured: Option<Measured>,
