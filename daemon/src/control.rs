@@ -2,6 +2,8 @@
 
 use crate::Result;
 use crate::status::{RecordingStatus, ReplayStatus, RigStatus};
+use depthrig_bus::UtcPair;
+use depthrig_recorder::{RecorderOptions, Session};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
@@ -41,10 +43,26 @@ pub trait Control: Send + Sync {
     /// Asks the daemon to end.
     fn request_stop(&self);
 
+    /// The streams of the rig now, for viewers of its live channels; `None` for a rig without channels.
+    fn live(&self) -> Option<LiveRig> {
+        None
+    }
+
     /// The controls of the replay, when the rig is one.
     fn replay(&self) -> Option<&dyn ReplayControl> {
         None
     }
+}
+
+/// The streams of a rig as a recording that began now would list them, those included that are not recorded.
+#[derive(Debug, Clone)]
+pub struct LiveRig {
+    /// The streams and IMUs.
+    pub session: Session,
+    /// How their images are stored.
+    pub options: RecorderOptions,
+    /// Both clocks of their times: in a replay those of the dataset.
+    pub utc: UtcPair,
 }
 
 /// Calls on a replay. A call that publishes a set returns when that was done, or after 3 s.

@@ -17,7 +17,7 @@ pub(crate) mod report;
 use crate::api::{self, ServerHandle};
 use crate::camera::{Camera, Shared, Supervisor};
 use crate::config::RigConfig;
-use crate::control::{Control, RecordRequest};
+use crate::control::{Control, LiveRig, RecordRequest};
 use crate::family::Preparation;
 use crate::housekeeping::Housekeeping;
 use crate::recording::{self, Begun, Outside, Recording, Reports, StreamFacts, recover_left};
@@ -213,7 +213,7 @@ impl Rig {
         // Before the cameras: a long start can then be asked about.
         if options.serve_api {
             let config = &rig.inner.config;
-            rig.api = Some(api::serve(rig.control(), &options.runtime, &config.rig, config.control.tcp)?);
+            rig.api = Some(api::serve(rig.control(), &options.runtime, &config.rig, config.control)?);
         }
         let inner = Arc::clone(&rig.inner);
         rig.spawn("supervisor", move |stop| supervise(&inner, stop))?;
@@ -486,6 +486,11 @@ impl Control for Inner {
 
     fn record_note(&self, text: &str) -> Result<()> {
         self.recording().note(text)
+    }
+
+    fn live(&self) -> Option<LiveRig> {
+        let utc = (self.outside.utc)();
+        Some(recording::live_rig(&self.config, self.stream_facts(), utc))
     }
 
     fn request_stop(&self) {

@@ -4,6 +4,7 @@
 //! stream only the newest frame is sent, so a viewer that is slow sees fewer images and never old ones. One thread encodes, below the priority of
 //! everything that captures; it exists while somebody watches.
 
+mod newest;
 mod pixel;
 mod worker;
 
@@ -13,6 +14,7 @@ use depthrig_bus::sync::lock;
 use depthrig_bus::{HostTime, RigName, RuntimeDir, StreamId};
 use depthrig_recorder::preview::PreviewKind;
 use hyper::body::Bytes;
+pub(crate) use newest::{Newest, next_turn};
 pub(crate) use pixel::{PixelAnswer, PixelQuestion};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Condvar, Mutex};
