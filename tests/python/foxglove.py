@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -108,3 +109,78 @@ def address(binary: str, runtime: Path, rig: str) -> str:
         assert time.monotonic() < deadline
         time.sleep(0.1)
     return text
+
+
+class _Library(SimpleHTTPRequestHandler):
+    """Serves the page, and Foxglove's client as the npm package has it.
+
+    Its modules name each other without an ending, and what it imports are CommonJS modules, which a browser does not load: `debug` is replaced, the
+    emitter wrapped.
+    """
+
+    def do_GET(self) -> None:
+        text = PAGES.get(self.path)
+        if text is None and self.path.startswith("/ws-protocol/"):
+            name = self.path.removeprefix("/ws-protocol/").removesuffix(".js")
+            text = (PROTOCOL / f"{name}.js").read_text()
+        elif text is None and self.path == "/eventemitter3.js":
+            emitter = (READERS / "node_modules" / "eventemitter3" / "index.js").read_text()
+            text = f"const module = {{ exports: {{}} }};\n{emitter}\nexport default module.exports;"
+        if text is None:
+            self.send_error(404)
+            return
+        self.send_response(200)
+        self.send_header("Content-Type", "text/html" if self.path == "/" else "text/javascript")
+        self.end_headers()
+        self.wfile.write(text.encode())
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+PROTOCOL = READERS / "node_modules" / "@foxglove" / "ws-protocol" / "dist" / "esm" / "src"
+PAGES = {
+    "/debug.js": "export default () => () => {};",
+    "/": """<!doctype html><title>viewer</title>
+<script type="importmap">{"imports": {"debug": "/debug.js", "eventemitter3": "/eventemitter3.js"}}</script>
+<script type="module">
+import FoxgloveClient from "/ws-protocol/FoxgloveClient.js";
+window.connect = (url, protocols) => {
+  const client = new FoxgloveClient({ ws: new WebSocket(url, protocols) });
+  const seen = { topics: {}, messages: {}, closed: false };
+  client.on("close", () => { seen.closed = true; });
+  client.on("advertise", (channels) => channels.forEach((c) => { seen.topics[c.topic] = c.id; }));
+  const subscribed = new Map();
+  client.on("message", ({ subscriptionId, data }) => {
+    const topic = subscribed.get(subscriptionId);
+    seen.messages[topic] = { bytes: data.byteLength, data, count: (seen.messages[topic]?.count ?? 0) + 1 };
+  });
+  seen.subscribe = (topic) => { subscribed.set(client.subscribe(seen.topics[topic]), topic); };
+  window.seen = seen;
+};
+// CDR by hand: the last bytes of a CompressedImage are its file, behind their number.
+window.pixels = async (topic, places) => {
+  const { data } = window.seen.messages[topic];
+  const bytes = new Uint8Array(data.buffer, data.byteOffset, data.byteLength);
+  const start = bytes.findIndex((b, i) => b === 0xff && bytes[i + 1] === 0xd8);
+  const image = await createImageBitmap(new Blob([bytes.subarray(start)], { type: "image/jpeg" }));
+  const canvas = new OffscreenCanvas(image.width, image.height);
+  const context = canvas.getContext("2d");
+  context.drawImage(image, 0, 0);
+  return places.map(([x, y]) => [...context.getImageData(x * image.width, y * image.height, 1, 1).data].slice(0, 3));
+};
+window.ready = true;
+</script>""",
+}
+
+
+@contextmanager
+def library_server() -> Iterator[str]:
+    """A page of another server than the rig, with Foxglove's client in it."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), _Library)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        yield f"http://127.0.0.1:{server.server_address[1]}/"
+    finally:
+        server.shutdown()
+        server.server_close()

@@ -6,6 +6,7 @@ Foxglove and Lichtblick themselves are no packages; their libraries are.
 from __future__ import annotations
 
 import json
+import re
 import signal
 import time
 from collections.abc import Iterator
@@ -15,11 +16,12 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-from foxglove import SUBPROTOCOLS, Viewer, address, viewer
+from foxglove import SUBPROTOCOLS, Viewer, address, library_server, viewer
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from page import PATCHES, SIMULATED, files_camera, free_port, pattern
-from test_daemon import WAIT_S, binary, command, running, runtime
+from page import CHROMIUM, PATCHES, SIMULATED, files_camera, free_port, pattern
+from playwright.sync_api import sync_playwright
+from test_daemon import ROOT, WAIT_S, binary, command, running, runtime
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
@@ -429,3 +431,76 @@ def test_a_replay_is_seen_with_the_times_of_its_dataset(binary: str, runtime: Pa
             depth = connected.message("/played/still/depth/image_raw")
             assert depth["probed"] == [p.depth_mm for p in PATCHES]
             assert min(abs(int(depth["time"]) - t) for t in recorded) < 1000
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium; tools/setup.sh test installs it")
+@pytest.mark.parametrize("protocol", SUBPROTOCOLS)
+def test_a_page_of_another_server_sees_the_images_in_chromium(rig: Rig, protocol: str) -> None:
+    color = topic("still/color")
+    with library_server() as page_url, sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM)
+        try:
+            page = browser.new_page()
+            page.set_default_timeout(WAIT_S * 1000)
+            problems: list[str] = []
+            page.on("pageerror", lambda e: problems.append(str(e)))
+            page.goto(page_url)
+            page.wait_for_function("window.ready")
+            page.evaluate("([url, protocol]) => window.connect(url, [protocol])", [rig.url, protocol])
+            page.wait_for_function("t => window.seen.topics[t] !== undefined", arg=color)
+            page.evaluate("t => window.seen.subscribe(t)", color)
+            page.wait_for_function("t => window.seen.messages[t]?.count >= 5", arg=color)
+            places = [[p.x, p.y] for p in PATCHES]
+            for patch, seen in zip(PATCHES, page.evaluate("([t, p]) => window.pixels(t, p)", [color, places]), strict=True):
+                assert max(abs(a - b) for a, b in zip(patch.color, seen, strict=True)) <= JPEG_ERROR, (patch, seen)
+            # Without the token a page is told nothing.
+            page.evaluate("([url, protocol]) => window.connect(url, [protocol])", [rig.url[:-1], protocol])
+            page.wait_for_function("window.seen.closed")
+            assert page.evaluate("Object.keys(window.seen.topics).length") == 0
+            assert problems == []
+        finally:
+            browser.close()
+
+
+def layout_names(value: object) -> Iterator[str]:
+    """Every text in the layout that names a topic or a service."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield from layout_names(key)
+            yield from layout_names(inner)
+    elif isinstance(value, list):
+        for inner in value:
+            yield from layout_names(inner)
+    elif isinstance(value, str) and value.startswith("/"):
+        yield value
+
+
+def panels(layout: object) -> Iterator[str]:
+    """The panels that a tree of a layout shows."""
+    if isinstance(layout, str):
+        yield layout
+    elif isinstance(layout, dict):
+        yield from panels(layout["first"])
+        yield from panels(layout["second"])
+
+
+def test_the_layout_is_one_of_the_default_rig(binary: str, runtime: Path, tmp_path: Path) -> None:
+    layout = json.loads((ROOT / "tools" / "foxglove" / "depthrig.json").read_text())
+    configs = layout["configById"]
+    tabs = [t["layout"] for c in configs.values() for t in c.get("tabs", ())]
+    shown = [name for tree in (layout["layout"], *tabs) for name in panels(tree)]
+    assert sorted(shown) == sorted(configs), "each panel is shown once"
+    kinds = [name.partition("!")[0] for name in shown]
+    assert kinds.count("Image") == 14 and {"3D", "DiagnosticSummary", "CallService"} <= set(kinds)
+    # Simple images: rendering the scenes takes minutes.
+    default = command(binary, runtime, "config", "show")
+    cheap = re.sub(r"^model = ", "cheap = true\nmodel = ", default, flags=re.MULTILINE)
+    (tmp_path / "rig.toml").write_text(cheap)
+    start = ("run", str(tmp_path / "rig.toml"), "-q", "--foxglove", str(free_port()))
+    with running(binary, runtime, tmp_path / "log", *start, codes=CODES), viewer(address(binary, runtime, "mount")) as connected:
+        services = {s["name"] for s in connected.wait("services")}
+        connected.know(*(set(layout_names(layout)) - services))
+        images = [t for t in set(layout_names(layout)) if t.endswith("image_compressed")]
+        connected.subscribe(*images)
+        for image in images:
+            connected.wait("message", lambda m, image=image: m["topic"] == image)
