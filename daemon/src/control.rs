@@ -3,9 +3,9 @@
 use crate::doctor::Examined;
 use crate::status::{RecordingStatus, ReplayStatus, RigStatus};
 use crate::{Error, ErrorKind, Result};
-use depthrig_bus::{RigName, RuntimeDir};
+use depthrig_bus::{RigName, RuntimeDir, UtcPair};
 use depthrig_driver::controls::ControlValue;
-use depthrig_recorder::Mark;
+use depthrig_recorder::{Mark, RecorderOptions, Session};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -100,6 +100,11 @@ pub trait Control: Send + Sync {
 
     /// Asks the daemon to end.
     fn request_stop(&self);
+
+    /// The streams of the rig now, for viewers of its live channels; `None` for a rig without channels.
+    fn live(&self) -> Option<LiveRig> {
+        None
+    }
 
     /// The controls of the replay, when the rig is one.
     fn replay(&self) -> Option<&dyn ReplayControl> {
@@ -209,6 +214,17 @@ pub struct Shown {
     pub rig: RigName,
     /// Ends it when dropped.
     pub replay: Box<dyn Send + Sync>,
+}
+
+/// The streams of a rig as a recording that began now would list them, those included that are not recorded.
+#[derive(Debug, Clone)]
+pub struct LiveRig {
+    /// The streams and IMUs.
+    pub session: Session,
+    /// How their images are stored.
+    pub options: RecorderOptions,
+    /// Both clocks of their times: in a replay those of the dataset.
+    pub utc: UtcPair,
 }
 
 /// Calls on a replay. A call that publishes a set returns when that was done, or after 3 s.

@@ -13,6 +13,7 @@ pub mod control;
 pub mod doctor;
 mod error;
 pub mod family;
+mod foxglove;
 mod housekeeping;
 pub mod metrics;
 mod priority;

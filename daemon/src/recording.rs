@@ -1,7 +1,7 @@
 //! Recording under control of the daemon: start, stop, notes, and the numbers that go with it.
 
 use crate::config::{RecordingConfig, RigConfig};
-use crate::control::RecordRequest;
+use crate::control::{LiveRig, RecordRequest};
 use crate::status::{RecordingStatus, SetAccount};
 use crate::stream::Stream;
 use crate::{Error, ErrorKind, Result};
@@ -134,9 +134,7 @@ impl Begun {
             max_spread_ns(streams.iter().map(|s| reach_ns(s, streams.iter().chain(&others), sets_hz)));
         let firmware = streams.iter().filter(|s| !s.firmware.is_empty());
         session.firmware = firmware.map(|s| (s.stream.id.camera.to_string(), s.firmware.clone())).collect();
-        session.computed = streams.iter().filter_map(|s| s.computed.clone()).collect();
-        session.streams = streams.iter().map(facts::record_of).collect();
-        session.motion = units.iter().map(motion::record_of).collect();
+        describe(&mut session, &streams, &units);
         let mut options = options_of(&config.recording);
         options.backlog_max_bytes = outside.backlog_max_bytes.unwrap_or(options.backlog_max_bytes);
         options.late_after_ns = outside.late_after_ns;
@@ -183,6 +181,22 @@ impl Begun {
             status,
         }))
     }
+}
+
+/// Lists streams and IMUs.
+fn describe(session: &mut Session, streams: &[StreamFacts], units: &[StreamFacts]) {
+    session.computed = streams.iter().filter_map(|s| s.computed.clone()).collect();
+    session.streams = streams.iter().map(facts::record_of).collect();
+    session.motion = units.iter().map(motion::record_of).collect();
+}
+
+/// The streams of a rig for viewers of its live channels, with its clocks.
+pub fn live_rig(config: &RigConfig, streams: Vec<StreamFacts>, utc: UtcPair) -> LiveRig {
+    let (units, streams): (Vec<_>, Vec<_>) =
+        streams.into_iter().partition(|s| s.stream.profile.format.is_motion());
+    let mut session = Session::new("live", config.rig.as_str());
+    describe(&mut session, &streams, &units);
+    LiveRig { session, options: options_of(&config.recording), utc }
 }
 
 impl Recording {

@@ -84,6 +84,8 @@ pub struct ReplayOptions {
     pub in_background: bool,
     /// Whether to serve the control API.
     pub serve_api: bool,
+    /// Where Foxglove finds it, beside the control API.
+    pub foxglove: Port,
 }
 
 impl Default for ReplayOptions {
@@ -99,6 +101,7 @@ impl Default for ReplayOptions {
             refine: None,
             in_background: false,
             serve_api: false,
+            foxglove: Port::Off,
         }
     }
 }
@@ -215,8 +218,8 @@ impl Replay {
             options.refine.map(|engine| refine::refinements(&inner, &bus, engine)).transpose()?;
         let mut replay = Self { inner, threads: Vec::new(), api: None, _lock: held };
         if options.serve_api {
-            let port = replay.inner.config.control.tcp;
-            replay.api = Some(api::serve(replay.control(), runtime, &rig, port)?);
+            let ports = ControlConfig { foxglove: options.foxglove, ..replay.inner.config.control };
+            replay.api = Some(api::serve(replay.control(), runtime, &rig, ports)?);
         }
         let inner = Arc::clone(&replay.inner);
         replay.spawn("housekeeping", move || housekeeping(&inner, &bus))?;
@@ -325,7 +328,7 @@ fn recording_config(sources: &mut Sources) -> RigConfig {
         bus: BusConfig::default(),
         sets: SetsConfig::default(),
         recording,
-        control: ControlConfig { tcp: Port::Any },
+        control: ControlConfig::default(),
         supervisor: SupervisorConfig::default(),
         cdm: CdmConfig::default(),
         calibration: None,

@@ -20,7 +20,7 @@ use crate::attached::System;
 use crate::camera::{Camera, Shared, Supervisor};
 use crate::config::RigConfig;
 use crate::control::{
-    CameraControls, Control, ControlChanges, ControlList, ControlRequest, RecordRequest, Shows,
+    CameraControls, Control, ControlChanges, ControlList, ControlRequest, LiveRig, RecordRequest, Shows,
 };
 use crate::doctor::{self, Surroundings};
 use crate::family::Preparation;
@@ -230,7 +230,7 @@ impl Rig {
         // Before the cameras: a long start can then be asked about.
         if options.serve_api {
             let config = &rig.inner.config;
-            rig.api = Some(api::serve(rig.control(), &options.runtime, &config.rig, config.control.tcp)?);
+            rig.api = Some(api::serve(rig.control(), &options.runtime, &config.rig, config.control)?);
         }
         let inner = Arc::clone(&rig.inner);
         rig.spawn("supervisor", move |stop| supervise(&inner, stop))?;
@@ -544,6 +544,11 @@ impl Control for Inner {
 
     fn record_note(&self, text: &str) -> Result<()> {
         self.recording().note(text)
+    }
+
+    fn live(&self) -> Option<LiveRig> {
+        let utc = (self.outside.utc)();
+        Some(recording::live_rig(&self.config, self.stream_facts(), utc))
     }
 
     fn request_stop(&self) {

@@ -189,11 +189,9 @@ pub fn restore() {
 /// Keeps the messages of panics until the terminal is given back; printed on the page they would vanish with it.
 fn keep_panics() {
     let before = std::panic::take_hook();
-    std::panic::set_hook(Box::new(move |panic| {
-        match TAKEN.try_lock().ok().as_deref_mut() {
-            Some(Some(taken)) => taken.panics.push(panic.to_string()),
-            _ => before(panic),
-        }
+    std::panic::set_hook(Box::new(move |panic| match TAKEN.try_lock().ok().as_deref_mut() {
+        Some(Some(taken)) => taken.panics.push(panic.to_string()),
+        _ => before(panic),
     }));
 }
 

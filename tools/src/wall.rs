@@ -130,7 +130,8 @@ fn fitted(image: RgbImage, width: u32, height: u32) -> RgbImage {
     if image.width() <= width && image.height() <= height {
         return image;
     }
-    let scale = (f64::from(width) / f64::from(image.width())).min(f64::from(height) / f64::from(image.height()));
+    let scale =
+        (f64::from(width) / f64::from(image.width())).min(f64::from(height) / f64::from(image.height()));
     let side = |n: u32| ((f64::from(n) * scale) as u32).max(1);
     image::imageops::thumbnail(&image, side(image.width()), side(image.height()))
 }

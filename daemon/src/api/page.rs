@@ -46,19 +46,26 @@ pub struct PageAddress {
     pub url: Option<String>,
     /// The file with the token, which the user that runs the rig can read.
     pub token_file: Option<PathBuf>,
+    /// Where viewers with Foxglove's protocol find the rig, without the token that follows; `None` where that is off.
+    #[serde(default)]
+    pub foxglove: Option<String>,
 }
 
 impl PageAddress {
-    pub(super) fn of(tcp: Option<SocketAddr>, token: Option<&Path>) -> Self {
-        let url = tcp.map(|tcp| {
+    pub(super) fn of(tcp: Option<SocketAddr>, foxglove: Option<SocketAddr>, token: Option<&Path>) -> Self {
+        let url = |scheme: &str, tcp: SocketAddr| {
             // A page of another name has another origin, and another place for its token.
             if tcp.ip() == IpAddr::V4(Ipv4Addr::LOCALHOST) {
-                format!("http://localhost:{}/", tcp.port())
+                format!("{scheme}://localhost:{}/", tcp.port())
             } else {
-                format!("http://{tcp}/")
+                format!("{scheme}://{tcp}/")
             }
-        });
-        Self { url, token_file: token.map(Path::to_owned) }
+        };
+        Self {
+            url: tcp.map(|tcp| url("http", tcp)),
+            token_file: token.map(Path::to_owned),
+            foxglove: foxglove.map(|tcp| url("ws", tcp)),
+        }
     }
 }
 

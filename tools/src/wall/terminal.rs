@@ -81,7 +81,8 @@ pub fn find(screen: &Screen, means: Option<Means>) -> Result<Terminal> {
     let answer = if is_multiplexed {
         Vec::new()
     } else {
-        screen.ask(&format!("{}{SIZE_AND_ATTRIBUTES}", kitty::QUESTION), ANSWER, |a| attributes(a).is_some())?
+        screen
+            .ask(&format!("{}{SIZE_AND_ATTRIBUTES}", kitty::QUESTION), ANSWER, |a| attributes(a).is_some())?
     };
     let cell = screen::cell()
         .map(|(width, height)| Cell { width, height })

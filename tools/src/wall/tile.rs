@@ -63,7 +63,8 @@ impl Tile {
             Ok(Some(frame)) => {
                 let header = frame.header();
                 // The frame's slot is free again when its preview is there.
-                let width = f64::from(size.height) * f64::from(header.width) / f64::from(header.height.max(1));
+                let width =
+                    f64::from(size.height) * f64::from(header.width) / f64::from(header.height.max(1));
                 let width = (width as u32).clamp(1, size.width.max(1));
                 preview(header, frame.pixels(), width).map_err(|e| e.to_string())
             }
