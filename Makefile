@@ -22,7 +22,7 @@ OAK := .venv-oak
 ROBOTS := .venv-robots
 REQUIREMENTS := python/requirements-test.txt $(READERS)/requirements.txt tests/page_browser/requirements.txt
 
-.PHONY: help demo demo-calibration environments test check-debian13 test-long vm fuzz lint bench bench-peers bench-feed clean setup-build setup-test setup-vm setup-peers setup-fuzz
+.PHONY: help demo demo-calibration environments test check-debian13 test-long vm fuzz lint dist test-dist bench bench-peers bench-feed clean setup-build setup-test setup-vm setup-peers setup-fuzz setup-dist
 
 help: ## show this list
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -67,6 +67,14 @@ lint: ## formatting and lints, as CI runs them
 	tools/words.py
 	@if command -v cargo-deny >/dev/null; then cargo deny check; else echo "cargo-deny is not installed: licences not checked"; fi
 
+# Architectures of the packages: x86_64, aarch64 or both.
+ARCH ?= x86_64 aarch64
+dist: setup-dist ## the wheel and the Debian package of each architecture, into dist/: make dist ARCH=x86_64
+	tools/dist/dist.sh $(ARCH)
+
+test-dist: setup-dist ## the packages in dist/ installed in a clean Debian 12 and 13, as root; the binary for aarch64 in QEMU
+	tests/dist/run $(ARGS)
+
 bench: setup-build ## the numbers of docs/performance.md
 	cargo build --release --package depthrig
 	target/release/depthrig bench bus
@@ -98,6 +106,9 @@ setup-vm:
 
 setup-fuzz:
 	@tools/setup.sh build fuzz
+
+setup-dist:
+	@tools/setup.sh build dist
 
 setup-peers:
 	@tools/setup.sh build peers
