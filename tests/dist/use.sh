@@ -1,26 +1,6 @@
 # Sourced: what an ordinary user does with an installed depthrig. `program` and `python` name them.
-cat >"$HOME/rig.toml" <<RIG
-rig = "clean"
-[recording]
-directory = "datasets"
-color = "raw"
-reserve_mb = 64
-[[camera]]
-name = "cam"
-backend = "synthetic"
-model = "generic"
-cheap = true
-[[camera.stream]]
-name = "color"
-width = 320
-height = 240
-rate_hz = 15.0
-[[camera.stream]]
-name = "depth"
-width = 320
-height = 240
-rate_hz = 15.0
-RIG
+. /test/rig.sh
+rig_file >"$HOME/rig.toml"
 export DEPTHRIG_RUNTIME_DIR=$HOME/runtime
 
 record() { # DATASETS PYTHON: records while Python subscribes, then verifies

@@ -25,8 +25,17 @@ export CFLAGS="$c_flags"
 export PKG_CONFIG_ALLOW_CROSS=1
 export PKG_CONFIG_LIBDIR=$PWD/$libusb
 
+# The kernel's interfaces as Zig's headers have them. maturin names these relative to this folder, and the build script that
+# reads them runs elsewhere.
+zig=$("$python" -c 'import pathlib, ziglang; print(pathlib.Path(ziglang.__file__).parent / "lib")')
+clang="-isystem $zig/include"
+for part in "${arch/x86_64/x86}-linux-gnu" generic-glibc "${arch/x86_64/x86}-linux-any" any-linux-any; do
+    clang+=" -isystem $zig/libc/include/$part"
+done
+
 # maturin and its cargo find Zig by the Python of this environment.
-rm -rf "target/dist/maturin/$arch"
-PATH=$PWD/target/dist/venv/bin:$PATH "$python" -m maturin build --release --zig --locked --target "$arch-unknown-linux-gnu" \
-    --out "target/dist/maturin/$arch"
-"$python" tools/dist/wheel.py "target/dist/maturin/$arch"/depthrig-*.whl "$libusb" "$folder"
+built=target/dist/maturin/$arch
+rm -rf "$built"
+env "PATH=${python%/*}:$PATH" "BINDGEN_EXTRA_CLANG_ARGS_$arch-unknown-linux-gnu=$clang" \
+    "$python" -m maturin build --release --zig --locked --target "$arch-unknown-linux-gnu" --out "$built"
+"$python" tools/dist/wheel.py "$built"/depthrig-*.whl "$libusb" "$folder"
