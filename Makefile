@@ -24,7 +24,7 @@ ROBOTS := .venv-robots
 DOCS := .venv-docs
 REQUIREMENTS := python/requirements-test.txt $(READERS)/requirements.txt tests/page_browser/requirements.txt tests/terminal/requirements.txt
 
-.PHONY: help demo demo-calibration environments test check-debian13 test-long vm fuzz lint docs bench bench-peers bench-feed clean setup-build setup-test setup-vm setup-peers setup-fuzz
+.PHONY: help demo demo-calibration environments test check-debian13 test-long vm fuzz lint docs dist test-dist bench bench-peers bench-feed clean setup-build setup-test setup-vm setup-peers setup-fuzz setup-dist
 
 help: ## show this list
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -74,6 +74,14 @@ docs: setup-build $(DOCS)/.stamp ## the site of the documents and the generated 
 	cargo build --workspace --bins --quiet
 	tools/docs/build.py site
 
+# Architectures of the packages: x86_64, aarch64 or both.
+ARCH ?= x86_64 aarch64
+dist: setup-dist ## the wheel and the Debian package of each architecture, into dist/: make dist ARCH=x86_64
+	tools/dist/dist.sh $(ARCH)
+
+test-dist: setup-dist ## the packages in dist/ installed in a clean Debian 12 and 13, as root; the binary for aarch64 in QEMU
+	tests/dist/run $(ARGS)
+
 bench: setup-build ## the numbers of docs/performance.md
 	cargo build --release --package depthrig
 	target/release/depthrig bench bus
@@ -105,6 +113,9 @@ setup-vm:
 
 setup-fuzz:
 	@tools/setup.sh build fuzz
+
+setup-dist:
+	@tools/setup.sh build dist
 
 setup-peers:
 	@tools/setup.sh build peers
