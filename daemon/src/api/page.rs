@@ -24,11 +24,16 @@ macro_rules! files {
 }
 
 /// The files in the folder `page`.
-pub(super) static FILES: [File; 30] = files![
-    "api.js" "blend.js" "colormap.js" "connection.js" "dom.js" "fit.js" "hover.js" "icon.svg"
-    "index.html" "keys.js" "labels.js" "layout.js" "main.js" "painter.js" "protocol.js" "range.js"
-    "recordbar.js" "recording.js" "recordtext.js" "replaybar.js" "scenes.js" "slot.js" "sound.js"
-    "style.css" "tile.js" "tilestate.js" "types.js" "wall.js" "watch.js" "words.js"
+pub(super) static FILES: [File; 55] = files![
+    "advice.js" "api.js" "blend.js" "boardoverlay.js" "calibrationpanel.js" "calibrationtext.js"
+    "colormap.js" "connection.js" "controlrow.js" "controlspanel.js" "controltext.js" "countdown.js"
+    "dataset.js" "doctorpanel.js" "dom.js" "doublepress.js" "eventstream.js" "fit.js" "hover.js"
+    "icon.svg" "index.html" "keys.js" "labels.js" "layout.js" "livestatus.js" "main.js" "painter.js"
+    "panels.css" "panels.js" "paneltypes.js" "protocol.js" "range.js" "ready.js" "recordbar.js"
+    "recording.js" "recordingrow.js" "recordings.js" "recordingtext.js" "recordtext.js"
+    "replaybar.js" "savedialog.js" "scenes.js" "skew.js" "slot.js" "sound.js" "style.css"
+    "syncpanel.js" "takes.js" "tile.js" "tilestate.js" "types.js" "usbtree.js" "wall.js" "watch.js"
+    "words.js"
 ];
 
 /// The WebSocket of the live page.
