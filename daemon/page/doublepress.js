@@ -18,9 +18,4 @@ export class DoublePress {
     this.#at = now;
     return isSecond;
   }
-
-  /** Forgets the first press. */
-  clear() {
-    this.#key = "";
-  }
 }

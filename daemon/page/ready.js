@@ -26,6 +26,14 @@ function some(names) {
 }
 
 /**
+ * @param {number} n
+ * @param {string} noun
+ */
+function counted(n, noun) {
+  return n === 0 ? "" : `${n} ${noun}${n === 1 ? "" : "s"}`;
+}
+
+/**
  * @param {Status} status
  * @param {DoctorReport | null} doctor `null`: not asked yet
  * @returns {Readiness}
@@ -44,8 +52,8 @@ export function readiness(status, doctor) {
     const errors = doctor.findings.filter(({ severity }) => severity === "error").length;
     const warnings = doctor.findings.filter(({ severity }) => severity === "warning").length;
     const list = errors > 0 ? bad : warnings > 0 ? odd : good;
-    const counts = [errors > 0 ? `${errors} errors` : "", warnings > 0 ? `${warnings} warnings` : ""].filter(Boolean);
-    list.push(counts.length > 0 ? `doctor has ${counts.join(" and ")} (D)` : "doctor found nothing");
+    const counts = [counted(errors, "error"), counted(warnings, "warning")].filter(Boolean).join(" and ");
+    list.push(counts === "" ? "doctor found nothing" : `doctor has ${counts} (D)`);
   }
   if (bad.length > 0) {
     return { state: "no-go", text: `No-go: ${[...bad, ...odd].join("; ")}` };

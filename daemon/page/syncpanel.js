@@ -22,7 +22,7 @@ export class SyncPanel {
     const table = make("table", "");
     table.append(makeText("caption", "", "Streams: distance of the capture from the tick of its set, ms"));
     table.append(headRow(["Stream", "Median", "95 %", "Window", ""]), this.#streams);
-    const legend = "Window: a frame further from the tick is in no set. Wide: beyond half of it.";
+    const legend = "Window: a frame further from the tick is in no set. Wide: the median is beyond half of it.";
     this.element.append(this.#summary, table, this.#pairs, makeText("p", "quiet", legend));
   }
 

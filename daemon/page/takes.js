@@ -43,7 +43,7 @@ export class Takes {
   redo() {
     if (this.#bar.state !== "recording") {
       this.#say("R redoes a recording that is running.");
-    } else if (this.#isSecond("r", "Press R again: this recording is marked bad, and the next one starts.")) {
+    } else if (this.#isSecond("Press R again: this recording is marked bad, and the next one starts.")) {
       void this.#bar.redo().then((isDone) => isDone && this.#say("Marked bad. Recording again."));
     }
   }
@@ -51,10 +51,10 @@ export class Takes {
   /** Ends the recording and marks it bad; the last one if none is running. */
   bad() {
     if (this.#bar.state === "recording") {
-      if (this.#isSecond("b", "Press B again: the recording ends and is marked bad.")) {
+      if (this.#isSecond("Press B again: the recording ends and is marked bad.")) {
         void this.#bar.stop("bad").then((isDone) => isDone && this.#say("Ended and marked bad. It is not deleted."));
       }
-    } else if (this.#last() && this.#isSecond("b", "Press B again: the last recording is marked bad.")) {
+    } else if (this.#last() && this.#isSecond("Press B again: the last recording is marked bad.")) {
       void this.#mark("bad");
     }
   }
@@ -77,17 +77,14 @@ export class Takes {
     }
   }
 
-  /** Forgets a first press. */
-  cancel() {
-    this.#twice.clear();
-  }
-
   /**
-   * @param {string} key
+   * Whether the question was answered by a second press. One key may ask two questions: the first press of the one must
+   * not answer the other.
+   *
    * @param {string} question
    */
-  #isSecond(key, question) {
-    if (this.#twice.press(key, performance.now())) {
+  #isSecond(question) {
+    if (this.#twice.press(question, performance.now())) {
       return true;
     }
     this.#say(question, TWICE_MS);

@@ -31,8 +31,6 @@ test("the same key twice in time is a double press, and only that", () => {
   assert.equal(twice.press("r", TWICE_MS + 1), false);
   assert.equal(twice.press("r", 2 * TWICE_MS + 2), false);
   assert.equal(twice.press("b", 2 * TWICE_MS + 3), false);
-  twice.clear();
-  assert.equal(twice.press("b", 2 * TWICE_MS + 4), false);
 });
 
 test("a countdown counts whole seconds, and a cancelled one starts nothing", (context) => {
@@ -108,7 +106,7 @@ test("few minutes, a wide spread and doctor's findings are said", () => {
   assert.match(readiness(rig(both), disk(700)).text, /11 h on the disk, .*doctor found nothing/);
   assert.match(readiness(rig(both, { spread_p95_ms: 40 }), null).text, /^Check: sets within 40.0 ms, more than a frame/);
   const warned = { ...disk(99), findings: [{ severity: "warning" }, { severity: "info" }] };
-  assert.match(readiness(rig(both), warned).text, /doctor has 1 warnings/);
+  assert.match(readiness(rig(both), warned).text, /doctor has 1 warning \(D\)/);
   const error = { ...disk(99), findings: [{ severity: "error" }] };
   assert.equal(readiness(rig(both), error).state, "no-go");
 });
