@@ -10,6 +10,15 @@ import { RecordingRow } from "./recordingrow.js";
 
 /** Reading the folders may take a while on a disk that is busy. */
 const LIST_MS = 20_000;
+/** The report of a recording is written after its end. */
+const REPORT_WITHIN_MS = 60_000;
+const REPORT_EVERY_MS = 2000;
+
+/** @param {RecordingEntry} entry */
+function isReportDue({ has_report, health, started_utc_ns, duration_ns }) {
+  const endedMs = ((started_utc_ns ?? 0) + (duration_ns ?? 0)) / 1e6;
+  return !has_report && health !== "recording" && Math.abs(Date.now() - endedMs) < REPORT_WITHIN_MS;
+}
 
 export class Recordings {
   title = "Recordings";
@@ -27,6 +36,7 @@ export class Recordings {
   /** @type {RecordingRow[]} whose images are to be fetched */
   #wanted = [];
   #isFetching = false;
+  #timer = 0;
   #isOpen = false;
   #isLoading = false;
   #isStale = false;
@@ -131,6 +141,10 @@ export class Recordings {
     setText(this.#where, recordings.length === 0 ? `No recordings in ${directory}` : `In ${directory}`);
     setText(this.#more, more > 0 ? `${more} older ones are not shown.` : "");
     void this.#fetchImages();
+    if (recordings.some(isReportDue)) {
+      clearTimeout(this.#timer);
+      this.#timer = setTimeout(() => void this.#load(), REPORT_EVERY_MS);
+    }
   }
 
   /** @param {RecordingEntry} entry */

@@ -19,7 +19,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 from PIL import Image
-from playwright.sync_api import Browser, BrowserContext, Locator, Page, Route
+from playwright.sync_api import Browser, BrowserContext, Error, Locator, Page, Route
 from test_daemon import WAIT_S, environment
 
 CHROMIUM = shutil.which("chromium")
@@ -273,8 +273,11 @@ def serve_from(context: BrowserContext, folder: Path) -> None:
     def answer(route: Route) -> None:
         parts = urlsplit(route.request.url)
         file = folder / (parts.path.strip("/") or "index.html")
-        # No answer is no page either.
-        served = route.fetch(url=f"{parts.scheme}://{parts.netloc}/")
+        try:
+            served = route.fetch(url=f"{parts.scheme}://{parts.netloc}/")
+        except Error:
+            route.abort()
+            return
         headers = {name: value for name, value in served.headers.items() if name not in ("content-length", "etag")}
         route.fulfill(body=file.read_bytes(), headers={**headers, "content-type": PAGE_TYPES[file.suffix]})
 
