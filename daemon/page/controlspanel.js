@@ -18,6 +18,7 @@ class CameraSection {
   #problem = make("p", "why");
   #list = make("div", "");
   #changed = make("span", "quiet");
+  #back;
   /** @type {Map<string, ControlRow>} */
   #rows = new Map();
   /** The controls that the rows were built for. */
@@ -33,10 +34,10 @@ class CameraSection {
   constructor(camera, set, revert) {
     this.#camera = camera;
     this.#set = set;
-    const back = makeButton("Back to the rig file", revert);
-    back.setAttribute("aria-label", `Back to the rig file: ${camera}`);
+    this.#back = makeButton("Back to the rig file", revert);
+    this.#back.setAttribute("aria-label", `Back to the rig file: ${camera}`);
     const head = make("div", "panel-line");
-    head.append(makeText("h3", "", camera), this.#changed, back);
+    head.append(makeText("h3", "", camera), this.#changed, this.#back);
     this.element.dataset.camera = camera;
     this.element.append(head, this.#problem, this.#list);
   }
@@ -44,6 +45,7 @@ class CameraSection {
   /** @param {CameraControls} entry */
   update(entry) {
     const { controls, problem } = entry;
+    this.#back.hidden = controls.length === 0;
     const none = controls.length === 0 ? "This camera has no controls." : "";
     setText(this.#problem, problem ?? none);
     const built = JSON.stringify(controls.map(({ name, kind, minimum, maximum, step, items }) => [name, kind, minimum, maximum, step, items]));

@@ -430,6 +430,127 @@ def test_doctor_shows_what_the_api_found(wall: Wall, rig: Address) -> None:
     save_screenshot(wall, "doctor")
 
 
+def gain(wall: Wall) -> Locator:
+    """The field of the gain of the simulated camera."""
+    return wall.page.locator('.camera-controls[data-camera="front"] .control[data-name="gain"] input[type="number"]')
+
+
+def set_gain(wall: Wall, value: int) -> None:
+    gain(wall).fill(str(value))
+    press(wall, "Enter")
+
+
+def gain_in(answer: dict[str, Any]) -> Any:
+    (front,) = (camera for camera in answer["cameras"] if camera["camera"] == "front")
+    return next(control["value"] for control in front["controls"] if control["name"] == "gain")
+
+
+def gain_in_file(folder: Path) -> Any:
+    return tomllib.loads((folder / "panels.toml").read_text())["camera"][0].get("gain")
+
+
+def written(wall: Wall) -> Locator:
+    """The question before the rig file is written."""
+    button(wall.page.locator("#panel-body"), "Write to rig file…").click()
+    dialog = wall.page.locator("#save-controls")
+    dialog.wait_for()
+    return dialog
+
+
+def test_a_control_takes_effect_at_once_and_comes_to_the_other_page(browser: Browser, rig: Address) -> None:
+    with opened(browser, rig) as one, opened(browser, rig) as two:
+        for wall in (one, two):
+            open_panel(wall, "c", "Camera controls")
+            gain(wall).wait_for()
+        for value in (40, 60):
+            set_gain(one, value)
+            until(lambda value=value: gain_in(ask(rig, "GET", "/v1/controls")) == value)
+            start = time.monotonic()
+            until(lambda value=value: gain(two).input_value() == str(value), gain(two).input_value)
+            took = time.monotonic() - start
+            print(f"the other page had {value} after {took:.2f} s")
+            assert took < OTHER_PAGE_S + SLACK_S
+        # Both at once: they end with the same, which is what the camera has.
+        set_gain(one, 70)
+        set_gain(two, 80)
+        until(lambda: gain(one).input_value() == gain(two).input_value() == str(gain_in(ask(rig, "GET", "/v1/controls"))))
+        save_screenshot(one, "controls")
+
+
+def test_the_slider_sets_the_newest_value(wall: Wall, rig: Address) -> None:
+    open_panel(wall, "c", "Camera controls")
+    slider = wall.page.locator('.camera-controls[data-camera="front"] .control[data-name="gain"] input[type="range"]')
+    slider.wait_for()
+    slider.focus()
+    press(wall, "Home")
+    until(lambda: gain_in(ask(rig, "GET", "/v1/controls")) == 16)
+    for _ in range(9):
+        press(wall, "ArrowRight")
+    until(lambda: gain_in(ask(rig, "GET", "/v1/controls")) == 25)
+    wall.page.wait_for_timeout(2500)
+    assert slider.input_value() == gain(wall).input_value() == "25"
+    # Keys of the page and of the slider do not mix.
+    assert wall.state("#record-state") == "idle"
+
+
+def test_a_value_that_is_refused_is_said_and_taken_back(wall: Wall, rig: Address) -> None:
+    panel = open_panel(wall, "c", "Camera controls")
+    gain(wall).wait_for()
+    before = gain_in(ask(rig, "GET", "/v1/controls"))
+    set_gain(wall, 9999)
+    wait_for_text(panel, "front, gain: ")
+    until(lambda: gain(wall).input_value() == str(before), gain(wall).input_value)
+
+
+def test_the_rig_file_is_written_after_a_look_at_the_difference(wall: Wall, folder: Path, rig: Address) -> None:
+    panel = open_panel(wall, "c", "Camera controls")
+    gain(wall).wait_for()
+    before = gain_in_file(folder)
+    set_gain(wall, 33)
+    until(lambda: gain_in(ask(rig, "GET", "/v1/controls")) == 33)
+    dialog = written(wall)
+    wait_for_text(dialog, "+gain = 33")
+    save_screenshot(wall, "difference")
+    press(wall, "Escape")
+    dialog.wait_for(state="hidden")
+    assert gain_in_file(folder) == before
+    assert wall.page.is_visible("#panel")
+    dialog = written(wall)
+    wait_for_text(dialog, "+gain = 33")
+    button(dialog, "Write").click()
+    dialog.wait_for(state="hidden")
+    assert gain_in_file(folder) == 33
+    wait_for_text(panel, "Written to")
+
+    # A change that is not wanted, back to the file.
+    set_gain(wall, 99)
+    wait_for_text(panel, "1 not as in the rig file")
+    panel.get_by_text("Back to the rig file", exact=True).first.click()
+    until(lambda: gain_in(ask(rig, "GET", "/v1/controls")) == 33)
+    until(lambda: gain(wall).input_value() == "33", gain(wall).input_value)
+
+
+def test_a_difference_that_is_old_is_not_written(browser: Browser, rig: Address, folder: Path) -> None:
+    with opened(browser, rig) as one, opened(browser, rig) as two:
+        for wall in (one, two):
+            open_panel(wall, "c", "Camera controls")
+            gain(wall).wait_for()
+        before = gain_in_file(folder)
+        set_gain(one, 44)
+        until(lambda: gain_in(ask(rig, "GET", "/v1/controls")) == 44)
+        dialog = written(two)
+        wait_for_text(dialog, "+gain = 44")
+        set_gain(one, 55)
+        until(lambda: gain_in(ask(rig, "GET", "/v1/controls")) == 55)
+        button(dialog, "Write").click()
+        wait_for_text(dialog, "Not written: the rig file or a control has changed since")
+        wait_for_text(dialog, "+gain = 55")
+        assert gain_in_file(folder) == before
+        button(dialog, "Write").click()
+        dialog.wait_for(state="hidden")
+        assert gain_in_file(folder) == 55
+
+
 CAPTURE = {
     "out": f"views {MARKUP}",
     "is_finished": False,
