@@ -278,11 +278,29 @@ def test_two_pages_steer_the_same_dataset(browser: Browser, rig: Address) -> Non
             wall.wait_for_state("#connection", "live")
         one.page.check("#replay-loop")
         until(lambda: two.page.is_checked("#replay-loop"))
+        # It may have come to its end meanwhile.
+        one.page.locator("#scrub").evaluate(SCRUB, 0)
         two.wait_for_state("#replay", "playing")
         press(one, "p")
         two.wait_for_state("#replay", "paused")
         press(two, "p")
         one.wait_for_state("#replay", "playing")
+
+
+def test_one_dataset_is_shown_at_a_time_and_a_page_may_change_it(browser: Browser, rig: Address) -> None:
+    first, second = record(rig), record(rig)
+    with opened(browser, rig) as one, opened(browser, rig) as two:
+        open_panel(one, "l", "Recordings")
+        for name in (first, second, first):
+            button(row(one, name), "Watch").click()
+            until(lambda name=name: one.page.inner_text("#replay-dataset") == name)
+            one.wait_for_state("#connection", "live")
+        two.open(f"{rig.origin}/?dataset={second}#token={rig.token}")
+        wait_for_text(two.page.locator("#connection"), "another page shows")
+        one.page.get_by_text("Back to live", exact=True).click()
+        # It is tried again, and there is room now.
+        two.wait_for_state("#connection", "live")
+        two.wait_for_image("still/color")
 
 
 @pytest.mark.parametrize("name", ["nothing-of-that-name", "../panels.toml", MARKUP], ids=["missing", "outside", "markup"])
@@ -327,8 +345,10 @@ def test_odd_recordings_are_listed_with_why(wall: Wall, rig: Address, folder: Pa
             wait_for_text(panel, f"{name} was not marked")
             button(entry, "Watch").click()
             wait_for_text(wall.page.locator("#connection"), "This dataset is not shown")
+            # No live image is taken for one of the dataset.
+            assert wall.page.locator("section.tile").count() == 0
             wall.page.get_by_text("Back to live", exact=True).click()
-            wall.wait_for_state("#connection", "live")
+            wall.wait_for_image("still/color")
     finally:
         shutil.rmtree(base.with_name("cut"))
         shutil.rmtree(base.with_name("later"))
@@ -374,6 +394,13 @@ def test_redo_and_bad_need_two_presses_and_delete_nothing(wall: Wall, folder: Pa
     wall.page.click("#take-undo")
     until(lambda: session(second).get("mark") is None, lambda: session(second))
     assert len(datasets(folder)) == len(before) + 2
+    # B asked about the running recording is no first press about the last one.
+    start(wall)
+    press(wall, "b")
+    stop(wall)
+    press(wall, "b")
+    wait_for_text(wall.page.locator("#take-said"), "the last recording is marked bad")
+    assert session(datasets(folder)[-1]).get("mark") is None
 
 
 def test_a_countdown_can_be_cancelled(wall: Wall, folder: Path) -> None:
