@@ -25,7 +25,7 @@ import depthrig
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("DEPTHRIG_TEST_DATA", ROOT.parent / "shared" / "data")).resolve()
-WAIT_S = 15.0
+WAIT_S = 60.0
 """Longer than anything takes on a loaded machine: only for tests that would otherwise hang."""
 
 
