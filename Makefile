@@ -20,9 +20,11 @@ FEED := .venv-feed
 OAK := .venv-oak
 # Robots' meshes and a ray tracer, for the alignment of cameras with a robot's arm.
 ROBOTS := .venv-robots
-REQUIREMENTS := python/requirements-test.txt $(READERS)/requirements.txt tests/page_browser/requirements.txt
+# mdBook, which makes the site of the documents.
+DOCS := .venv-docs
+REQUIREMENTS := python/requirements-test.txt $(READERS)/requirements.txt tests/page_browser/requirements.txt tests/terminal/requirements.txt
 
-.PHONY: help demo demo-calibration environments test check-debian13 test-long vm fuzz lint bench bench-peers bench-feed clean setup-build setup-test setup-vm setup-peers setup-fuzz
+.PHONY: help demo demo-calibration environments test check-debian13 test-long vm fuzz lint docs dist test-dist bench bench-peers bench-feed clean setup-build setup-test setup-vm setup-peers setup-fuzz setup-dist
 
 help: ## show this list
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -34,7 +36,7 @@ demo: setup-build ## the mount of seven cameras with ten depth modes, without a 
 demo-calibration: setup-build ## seven simulated cameras and a printed board: views, calibration, the cloud before and after
 	tools/demo-calibration.sh $(ARGS)
 
-environments: $(VENV)/.stamp $(LEROBOT)/.stamp $(OAK)/.stamp $(ROBOTS)/.stamp $(READERS)/node_modules/.stamp ## the environments of Python and Node that tests need
+environments: $(VENV)/.stamp $(LEROBOT)/.stamp $(OAK)/.stamp $(ROBOTS)/.stamp $(DOCS)/.stamp $(READERS)/node_modules/.stamp ## the environments of Python and Node that tests need
 	tools/python.sh environments
 
 test: setup-test environments ## every test: Rust, Python, third-party readers, the virtual machine
@@ -65,7 +67,20 @@ lint: ## formatting and lints, as CI runs them
 	tools/notice.py --check
 	tools/cycles.py
 	tools/words.py
+	tools/docs/build.py check
 	@if command -v cargo-deny >/dev/null; then cargo deny check; else echo "cargo-deny is not installed: licences not checked"; fi
+
+docs: setup-build $(DOCS)/.stamp ## the site of the documents and the generated reference, in target/book
+	cargo build --workspace --bins --quiet
+	tools/docs/build.py site
+
+# Architectures of the packages: x86_64, aarch64 or both.
+ARCH ?= x86_64 aarch64
+dist: setup-dist ## the wheel and the Debian package of each architecture, into dist/: make dist ARCH=x86_64
+	tools/dist/dist.sh $(ARCH)
+
+test-dist: setup-dist ## the packages in dist/ installed in a clean Debian 12 and 13, as root; the binary for aarch64 in QEMU
+	tests/dist/run $(ARGS)
 
 bench: setup-build ## the numbers of docs/performance.md
 	cargo build --release --package depthrig
@@ -85,7 +100,7 @@ bench-feed: setup-build $(FEED)/.stamp ## latency to a NumPy array in another pr
 
 clean: ## remove build outputs
 	cargo clean
-	rm -rf $(VENV) $(LEROBOT) $(PEERS_VENV) $(FEED) $(OAK) $(ROBOTS) $(READERS)/node_modules
+	rm -rf $(VENV) $(LEROBOT) $(PEERS_VENV) $(FEED) $(OAK) $(ROBOTS) $(DOCS) $(READERS)/node_modules
 
 setup-build:
 	@tools/setup.sh build
@@ -98,6 +113,9 @@ setup-vm:
 
 setup-fuzz:
 	@tools/setup.sh build fuzz
+
+setup-dist:
+	@tools/setup.sh build dist
 
 setup-peers:
 	@tools/setup.sh build peers
@@ -130,6 +148,10 @@ $(OAK)/.stamp: python/requirements-oak.txt
 $(ROBOTS)/.stamp: tests/python/requirements-robots.txt tests/python/robots_only.py
 	tools/environment.sh $(ROBOTS) python3 --no-deps --no-cache-dir --requirement $<
 	$(ROBOTS)/bin/python tests/python/robots_only.py
+	touch $@
+
+$(DOCS)/.stamp: tools/docs/requirements.txt
+	tools/environment.sh $(DOCS) python3 --require-hashes --requirement $<
 	touch $@
 
 $(READERS)/node_modules/.stamp: $(READERS)/package.json $(READERS)/package-lock.json

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Installs the Debian packages for building (`build`), testing (`test`), testing on a real kernel (`vm`), comparing with
-# other recorders (`peers`) and fuzzing (`fuzz`) if permitted; else prints the command to run. Prints nothing if all are
-# installed.
+# other recorders (`peers`), fuzzing (`fuzz`) and building and testing packages (`dist`) if permitted; else prints the
+# command to run. Prints nothing if all are installed.
 set -euo pipefail
 
 # Prefix to run apt-get with; empty if not permitted.
@@ -60,6 +60,8 @@ for part in "$@"; do
         need g++ command -v c++
         # Inspects the dependencies of a program.
         need binutils command -v objdump
+        # Decodes the sixel images of `top`.
+        need libsixel-bin command -v sixel2png
         # The browser that the live page is tested in.
         need chromium command -v chromium
         # The boxes that tests run in.
@@ -88,8 +90,20 @@ for part in "$@"; do
         # libFuzzer is C++ and is built with the targets.
         need g++ command -v c++
         ;;
+    dist)
+        need python3 command -v python3
+        need python3-venv python3 -c 'import ensurepip, venv'
+        need dpkg command -v dpkg-deb
+        need lintian command -v lintian
+        # Systems without anything installed, in which the packages are tried.
+        need mmdebstrap command -v mmdebstrap
+        need util-linux command -v unshare
+        # Runs the binary for aarch64.
+        need qemu-user command -v qemu-aarch64
+        need binutils command -v objdump
+        ;;
     *)
-        echo "usage: tools/setup.sh [build] [test] [vm] [peers] [fuzz]" >&2
+        echo "usage: tools/setup.sh [build] [test] [vm] [peers] [fuzz] [dist]" >&2
         exit 2
         ;;
     esac

@@ -134,6 +134,8 @@ step rust-busy "$runner" "$built" "${small[@]}" --nofile 256 --only depthrig-tes
 
 step daemon box -- "${tests[@]}" tests/python
 step page box -- node --test tests/page/
+step page-types box -- tests/readers/node_modules/.bin/tsc --project tests/page
+step page-lint box -- tests/readers/node_modules/.bin/oxlint --config tests/page/oxlint.json daemon/page tests/page
 
 # Third-party readers must find the same pixels.
 work=$home/t/readers
@@ -175,7 +177,7 @@ count() { # WORD
 failed_steps=$(tr '\n' ' ' 2>/dev/null <"$logs/failed")
 passed=$(count passed)
 failed=$(($(count failed) + $(count 'errors?\b')))
-for log in "$logs"/binary.log "$logs"/golden*.log "$logs"/reader-*.log; do
+for log in "$logs"/binary.log "$logs"/page*.log "$logs"/golden*.log "$logs"/reader-*.log; do
     name=$(basename "$log" .log)
     case " $failed_steps " in
     *" $name "*) failed=$((failed + 1)) ;;

@@ -1,7 +1,8 @@
 /** The WebSocket `/v1/live`: token, reconnecting, and who gets which message. */
 
+import { socketAddress } from "./dataset.js";
 import { CLOSED, PROTOCOL, parseImage, parseText } from "./protocol.js";
-import { creditMessage, pixelMessage, tokenMessage, watchMessage } from "./protocol.js";
+import { creditMessage, pixelMessage, replayMessage, tokenMessage, watchMessage } from "./protocol.js";
 
 /** @typedef {import("./types.js").Hello} Hello */
 /** @typedef {import("./types.js").Status} Status */
@@ -28,6 +29,8 @@ const LONGEST_PAUSE_MS = 5000;
 
 /** The status comes twice a second: a connection that says nothing for so long is dead, though TCP may not know. */
 const SILENCE_MS = 5000;
+/** Opening a dataset takes as long as its disk needs. */
+const OPENING_MS = 20_000;
 
 const DENIED_TEXT = "This page needs a token. Run “depthrig open” and use the address that it prints.";
 const WRONG_TOKEN_TEXT =
@@ -38,6 +41,8 @@ export class Connection {
   /** @type {WebSocket | null} */
   #socket = null;
   #token = "";
+  /** @type {string | null} the dataset that is shown instead of the live rig */
+  #dataset = null;
   #pauseMs = FIRST_PAUSE_MS;
   #retryTimer = 0;
   #silenceTimer = 0;
@@ -55,8 +60,12 @@ export class Connection {
     return this.#isLive;
   }
 
-  /** @param {string | null} token */
-  open(token) {
+  /**
+   * @param {string | null} token
+   * @param {string | null} dataset to show; `null`: the live rig
+   */
+  open(token, dataset) {
+    this.#dataset = dataset;
     clearTimeout(this.#retryTimer);
     this.#drop();
     if (token === null || token === "") {
@@ -92,9 +101,18 @@ export class Connection {
     this.#send(pixelMessage(id, place));
   }
 
+  /**
+   * Steers the dataset that is shown.
+   *
+   * @param {string} command
+   * @param {Record<string, unknown>} body
+   */
+  steer(command, body) {
+    this.#send(replayMessage(command, body));
+  }
+
   #connect() {
-    const scheme = location.protocol === "https:" ? "wss" : "ws";
-    const socket = new WebSocket(`${scheme}://${location.host}/v1/live`);
+    const socket = new WebSocket(socketAddress(location, this.#dataset));
     socket.binaryType = "arraybuffer";
     this.#socket = socket;
     this.#watchNumber = 0;
@@ -191,7 +209,9 @@ export class Connection {
       return;
     }
     let text = LOST_TEXT;
-    if (code === CLOSED.TOO_MANY_PAGES) {
+    if (code === CLOSED.NOT_SHOWN) {
+      text = `This dataset is not shown: ${reason}`;
+    } else if (code === CLOSED.TOO_MANY_PAGES) {
       text = "Too many pages of this rig are open; close one. It is tried again.";
     } else if (code === CLOSED.MISUNDERSTOOD) {
       text = `The daemon did not understand this page: ${reason}. It is tried again.`;
@@ -205,12 +225,13 @@ export class Connection {
 
   /** @param {WebSocket} socket */
   #hearSilence(socket) {
+    const isOpening = this.#dataset !== null && !this.#isLive;
     clearTimeout(this.#silenceTimer);
     this.#silenceTimer = setTimeout(() => {
       if (socket === this.#socket) {
         this.#closed(0, "");
       }
-    }, SILENCE_MS);
+    }, isOpening ? OPENING_MS : SILENCE_MS);
   }
 
   #drop() {

@@ -55,6 +55,32 @@ export function make(tag, className) {
 }
 
 /**
+ * An element with a class and a text.
+ *
+ * @template {keyof HTMLElementTagNameMap} K
+ * @param {K} tag
+ * @param {string} className
+ * @param {string} text
+ * @returns {HTMLElementTagNameMap[K]}
+ */
+export function makeText(tag, className, text) {
+  const element = make(tag, className);
+  element.textContent = text;
+  return element;
+}
+
+/**
+ * @param {string} text
+ * @param {() => void} onClick
+ */
+export function makeButton(text, onClick) {
+  const button = makeText("button", "", text);
+  button.type = "button";
+  button.addEventListener("click", onClick);
+  return button;
+}
+
+/**
  * Reads aloud what changed, for those who do not see the colour change.
  *
  * @param {string} text

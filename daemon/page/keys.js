@@ -1,17 +1,37 @@
 /** Keys of the page: a table, and what is left to the control that has the focus. */
 
 /**
+ * @typedef {import("./panels.js").PanelName} PanelName
+ *
  * @typedef {Object} KeyTarget what of the focused element matters
  * @property {boolean} isText it takes text
  * @property {boolean} takesSpace Space presses it
  * @property {boolean} takesEnter Enter presses it
  * @property {boolean} takesArrows arrows move it
+ * @property {boolean} takesLetters letters choose in it
  * @property {boolean} isInDialog
  *
  * @typedef {{action: "toggleRecord" | "note" | "back" | "help" | "enlarge" | "playPause" | "cloud" | "aids"}
+ *   | {action: "redo" | "bad" | "good" | "mark"} | {action: "panel", panel: PanelName}
  *   | {action: "step", sets: number} | {action: "camera", n: number}} KeyAction
  */
 
+/** @type {Record<string, KeyAction>} */
+const LETTERS = {
+  n: { action: "note" },
+  p: { action: "playPause" },
+  r: { action: "redo" },
+  b: { action: "bad" },
+  g: { action: "good" },
+  m: { action: "mark" },
+  v: { action: "cloud" },
+  a: { action: "aids" },
+  l: { action: "panel", panel: "recordings" },
+  y: { action: "panel", panel: "sync" },
+  d: { action: "panel", panel: "doctor" },
+  c: { action: "panel", panel: "controls" },
+  k: { action: "panel", panel: "calibration" },
+};
 const TEXT_INPUTS = ["text", "search", "number", "email", "url", "password", "tel"];
 
 /**
@@ -29,6 +49,7 @@ export function keyTarget(target) {
     takesSpace: isButton || isSelect || type === "checkbox",
     takesEnter: isButton || isSelect,
     takesArrows: type === "range" || isSelect,
+    takesLetters: isSelect,
     isInDialog: element !== null && element.closest("dialog") !== null,
   };
 }
@@ -55,6 +76,9 @@ export function actionOf(event, target) {
   if (event.repeat) {
     return null;
   }
+  if (target.takesLetters && /^[a-z0-9]$/i.test(event.key)) {
+    return null;
+  }
   if (/^[1-9]$/.test(event.key)) {
     return { action: "camera", n: Number(event.key) };
   }
@@ -67,19 +91,7 @@ export function actionOf(event, target) {
       return { action: "back" };
     case "?":
       return { action: "help" };
-    case "v":
-    case "V":
-      return { action: "cloud" };
-    case "a":
-    case "A":
-      return { action: "aids" };
-    case "n":
-    case "N":
-      return { action: "note" };
-    case "p":
-    case "P":
-      return { action: "playPause" };
     default:
-      return null;
+      return LETTERS[event.key.toLowerCase()] ?? null;
   }
 }

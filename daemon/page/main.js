@@ -4,16 +4,25 @@ import { Aids } from "./aids.js";
 import { takeToken } from "./api.js";
 import { Blend } from "./blend.js";
 import { CloudView } from "./cloudview.js";
+import { CalibrationPanel } from "./calibrationpanel.js";
 import { Connection } from "./connection.js";
+import { ControlsPanel } from "./controlspanel.js";
+import { addressOf, datasetOf } from "./dataset.js";
+import { DoctorPanel } from "./doctorpanel.js";
 import { announce, byId, releaseFocusAfterClicks, setState, setText } from "./dom.js";
 import { Hover } from "./hover.js";
 import { actionOf, keyTarget } from "./keys.js";
 import { TileLabels } from "./labels.js";
+import { LiveStatus } from "./livestatus.js";
+import { Panels } from "./panels.js";
 import { PROTOCOL } from "./protocol.js";
 import { DepthRange } from "./range.js";
 import { RecordBar } from "./recordbar.js";
+import { Recordings } from "./recordings.js";
 import { ReplayBar } from "./replaybar.js";
 import { play, setUpSound } from "./sound.js";
+import { SyncPanel } from "./syncpanel.js";
+import { Takes } from "./takes.js";
 import { Wall } from "./wall.js";
 
 /** @typedef {import("./types.js").Status} Status */
@@ -87,7 +96,22 @@ Object.assign(debug, { view: cloud.facts, aids });
 const labels = new TileLabels(wall);
 const hover = new Hover(wall.tiles, (id, place) => connection.askPixel(id, place));
 const recordBar = new RecordBar();
-const replayBar = new ReplayBar();
+const recordings = new Recordings((name) => watchDataset(name));
+const takes = new Takes(recordBar, (entry) => recordings.marked(entry));
+const replayBar = new ReplayBar(
+  (command, body) => connection.steer(command, body),
+  () => watchDataset(null),
+);
+const panels = new Panels({
+  recordings,
+  sync: new SyncPanel(),
+  doctor: new DoctorPanel((report) => recordBar.setDoctor(report)),
+  controls: new ControlsPanel(),
+  calibration: new CalibrationPanel(wall.tiles),
+});
+const liveStatus = new LiveStatus(showLiveStatus);
+/** @type {string | null} the dataset that is shown instead of the live rig */
+let dataset = datasetOf(location.search);
 
 const connection = new Connection({
   onState: showConnection,
@@ -132,8 +156,9 @@ function welcome(hello) {
   const protocols = `This page speaks protocol ${PROTOCOL}, the daemon ${hello.protocol}.`;
   setText(byId("version-text", HTMLElement), hello.version === own ? protocols : versions);
   setText(byId("rig", HTMLElement), hello.rig);
-  document.title = `${hello.rig}${hello.is_replay ? " (replay)" : ""} · depthrig`;
-  replayBar.show(hello.is_replay);
+  const shown = hello.dataset ?? null;
+  document.title = `${shown ?? hello.rig}${hello.is_replay ? " (replay)" : ""} · depthrig`;
+  replayBar.show(hello.is_replay, shown);
 }
 
 /** @param {Status} next */
@@ -150,11 +175,19 @@ function showStatus(next) {
       }
     }
   }
-  recordBar.update(next);
+  if (dataset === null) {
+    showLiveStatus(next);
+  }
   replayBar.update(next.replay);
   setText(byId("preparing", HTMLElement), preparingText(next));
   const { sets } = next;
   setText(byId("sets", HTMLElement), sets.sent === 0 ? "" : `${sets.sent} sets, ${sets.incomplete} incomplete`);
+}
+
+/** @param {Status} next of the live rig, whatever the wall shows */
+function showLiveStatus(next) {
+  recordBar.update(next);
+  panels.update(next);
 }
 
 /** @param {Status} next */
@@ -203,6 +236,46 @@ function showTiles() {
   labels.show(facts, now);
 }
 
+/**
+ * Shows a dataset on the wall, or the live rig.
+ *
+ * @param {string | null} name
+ */
+function watchDataset(name) {
+  if (name !== dataset) {
+    history.pushState(null, "", addressOf(location.pathname, name));
+    showDataset(name);
+  }
+}
+
+/** @param {string | null} name */
+function showDataset(name) {
+  dataset = name;
+  status = null;
+  hover.hide();
+  // The tiles of a dataset have the names of the live ones: no image of one may be taken for the other.
+  wall.clear();
+  recordings.setWatched(name);
+  recordBar.setLiveRig(name === null);
+  replayBar.show(name !== null, name);
+  connection.open(takeToken(), name);
+  liveStatus.follow(name !== null);
+  announce(name === null ? "Live" : `Replay of ${name}`);
+}
+
+/** One step back: from the enlarged image, the panel, the dataset. */
+function goBack() {
+  if (cloud.isOpen) {
+    cloud.close();
+  } else if (wall.enlarged !== null) {
+    wall.enlarge(null);
+  } else if (panels.isOpen) {
+    panels.close();
+  } else if (dataset !== null) {
+    watchDataset(null);
+  }
+}
+
 /** @param {import("./keys.js").KeyAction} action */
 function act(action) {
   switch (action.action) {
@@ -211,7 +284,17 @@ function act(action) {
     case "note":
       return recordBar.focusNotes();
     case "back":
-      return cloud.isOpen ? cloud.close() : wall.enlarge(null);
+      return goBack();
+    case "panel":
+      return panels.toggle(action.panel);
+    case "redo":
+      return takes.redo();
+    case "bad":
+      return takes.bad();
+    case "good":
+      return takes.good();
+    case "mark":
+      return void takes.mark();
     case "help":
       return byId("help", HTMLDialogElement).showModal();
     case "cloud":
@@ -256,6 +339,11 @@ function showAids() {
 
 function setUpKeys() {
   document.addEventListener("keydown", (event) => {
+    // Whatever has the focus: nobody expects a recording to start after Esc.
+    if (event.key === "Escape" && recordBar.cancelCountdown()) {
+      event.preventDefault();
+      return;
+    }
     const target = keyTarget(event.target);
     if (event.key === "Escape" && target.isText && event.target instanceof HTMLElement) {
       event.target.blur();
@@ -277,7 +365,17 @@ byId("show-help", HTMLButtonElement).addEventListener("click", () => byId("help"
 byId("close-help", HTMLButtonElement).addEventListener("click", () => byId("help", HTMLDialogElement).close());
 byId("reload", HTMLButtonElement).addEventListener("click", () => location.reload());
 // A new address in the same tab changes the fragment only, and loads nothing.
-addEventListener("hashchange", () => connection.open(takeToken()));
+addEventListener("hashchange", () => connection.open(takeToken(), dataset));
+addEventListener("popstate", () => {
+  const named = datasetOf(location.search);
+  if (named !== dataset) {
+    showDataset(named);
+  }
+});
 
 setInterval(showTiles, STATE_EVERY_MS);
-connection.open(takeToken());
+if (dataset === null) {
+  connection.open(takeToken(), null);
+} else {
+  showDataset(dataset);
+}

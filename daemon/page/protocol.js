@@ -17,6 +17,7 @@ export const MAX_WATCHED = 64;
 export const CLOSED = Object.freeze({
   MISUNDERSTOOD: 4400,
   DENIED: 4401,
+  NOT_SHOWN: 4404,
   NO_TOKEN_IN_TIME: 4408,
   TOO_MANY_PAGES: 4429,
 });
@@ -129,4 +130,14 @@ export function creditMessage() {
  */
 export function pixelMessage(id, place) {
   return JSON.stringify({ pixel: { id, stream: place.stream, x: place.x, y: place.y } });
+}
+
+/**
+ * Steers the dataset that this connection shows.
+ *
+ * @param {string} command
+ * @param {Record<string, unknown>} body
+ */
+export function replayMessage(command, body) {
+  return JSON.stringify({ replay: { [command]: body } });
 }

@@ -1,7 +1,9 @@
 /** The record bar: start, stop, notes, and how the recording stands. */
 
-import { ApiError, post } from "./api.js";
+import { ApiError, messageOf, post } from "./api.js";
+import { Countdown } from "./countdown.js";
 import { announce, byId, setState, setText, store, stored } from "./dom.js";
+import { readiness } from "./ready.js";
 import { RecordingWatch, isOlder } from "./recording.js";
 import { recordTexts } from "./recordtext.js";
 import { addScene, parseScenes } from "./scenes.js";
@@ -12,6 +14,7 @@ import { play } from "./sound.js";
 
 const SCENES_KEY = "depthrig-scenes";
 const OPERATOR_KEY = "depthrig-operator";
+const COUNTDOWN_KEY = "depthrig-countdown";
 /** New losses sound at most so often. */
 const LOSS_SOUND_MS = 2000;
 /** An older status may come so long after an answer; a clock that is set back must not stop the bar for longer. */
@@ -32,9 +35,12 @@ export class RecordBar {
   #state = byId("record-state", HTMLElement);
   #progress = byId("record-progress", HTMLElement);
   #losses = byId("losses", HTMLElement);
+  #advice = byId("loss-advice", HTMLElement);
+  #ready = byId("ready", HTMLElement);
   #disk = byId("disk", HTMLElement);
   #error = byId("record-error", HTMLElement);
   #warning = byId("record-warning", HTMLElement);
+  #seconds = byId("countdown", HTMLSelectElement);
   #watch = new RecordingWatch();
   /** @type {Status | null} */
   #status = null;
@@ -48,8 +54,24 @@ export class RecordBar {
   #lossSoundAt = -Infinity;
   #toldError = "";
   #isLive = false;
+  /** Whether the page shows the live rig, and no dataset. */
+  #isLiveRig = true;
+  /** @type {import("./paneltypes.js").DoctorReport | null} */
+  #doctor = null;
+  #countdown = new Countdown(
+    (left) => this.#counted(left),
+    () => {
+      this.#enable();
+      void this.#start(false);
+    },
+  );
 
   constructor() {
+    this.#seconds.value = stored(COUNTDOWN_KEY) ?? "0";
+    if (this.#seconds.selectedIndex < 0) {
+      this.#seconds.value = "0";
+    }
+    this.#seconds.addEventListener("change", () => store(COUNTDOWN_KEY, this.#seconds.value));
     this.#operator.value = stored(OPERATOR_KEY) ?? "";
     this.#offerScenes(parseScenes(stored(SCENES_KEY)));
     this.#button.addEventListener("click", () => this.toggle());
@@ -63,12 +85,68 @@ export class RecordBar {
     this.#enable();
   }
 
-  /** Starts a recording, or stops the one that goes on. */
+  /** `null` before the first status */
+  get state() {
+    return this.#shown;
+  }
+
+  /** The last recording of this daemon, or the one that goes on. */
+  get last() {
+    return this.#status?.recording ?? null;
+  }
+
+  /** Starts a recording, after the countdown if one is chosen; stops the countdown, or the one that goes on. */
   toggle() {
-    if (!this.#isReady) {
+    if (this.cancelCountdown() || !this.#isReady) {
       return;
     }
-    void (this.#shown === "recording" ? this.#stop() : this.#start(false));
+    if (this.#shown === "recording") {
+      void this.stop(null);
+    } else {
+      this.#begin();
+    }
+  }
+
+  /** @returns {boolean} whether one was running */
+  cancelCountdown() {
+    const wasRunning = this.#countdown.cancel();
+    if (wasRunning) {
+      announce("Countdown cancelled");
+      this.#enable();
+    }
+    return wasRunning;
+  }
+
+  #begin() {
+    const seconds = Number(this.#seconds.value);
+    if (seconds > 0) {
+      this.#countdown.start(seconds);
+    } else {
+      void this.#start(false);
+    }
+  }
+
+  /** @param {number} left */
+  #counted(left) {
+    play("count");
+    announce(String(left));
+    this.#enable();
+  }
+
+  /**
+   * Ends the recording, marks it bad and starts the next one of the same scene and operator.
+   *
+   * @returns {Promise<boolean>} whether it was ended and marked
+   */
+  async redo() {
+    const before = this.last;
+    if (!(await this.stop("bad"))) {
+      return false;
+    }
+    this.#scene.value = before?.scene ?? this.#scene.value;
+    this.#operator.value = before?.operator ?? this.#operator.value;
+    this.#begin();
+    return true;
   }
 
   /** Whether a start or a stop can be asked for. */
@@ -85,7 +163,38 @@ export class RecordBar {
   setLive(isLive) {
     this.#isLive = isLive;
     this.#bar.classList.toggle("is-old", !isLive);
+    if (!isLive) {
+      this.cancelCountdown();
+    }
     this.#enable();
+  }
+
+  /** @param {boolean} isLiveRig whether the page shows the live rig, and no dataset */
+  setLiveRig(isLiveRig) {
+    this.#isLiveRig = isLiveRig;
+    this.#status = null;
+    this.#showReady();
+  }
+
+  /** @param {import("./paneltypes.js").DoctorReport} doctor */
+  setDoctor(doctor) {
+    this.#doctor = doctor;
+    this.#showReady();
+  }
+
+  /** Whether a start would record what one wants. */
+  #showReady() {
+    const status = this.#status;
+    if (!this.#isLiveRig) {
+      setState(this.#ready, "check");
+      setText(this.#ready, "A recording is of the live rig, not of the dataset that is shown");
+    } else if (status === null || status.replay !== null || this.#shown !== "idle") {
+      setText(this.#ready, "");
+    } else {
+      const { state, text } = readiness(status, this.#doctor);
+      setState(this.#ready, state);
+      setText(this.#ready, text);
+    }
   }
 
   /** @param {Status} status */
@@ -101,9 +210,11 @@ export class RecordBar {
     const texts = recordTexts(recording, facts);
     setText(this.#progress, texts.progress);
     setText(this.#losses, texts.losses);
+    setText(this.#advice, texts.advice);
     setState(this.#losses, texts.hasLosses ? "lost" : "none");
     setText(this.#disk, texts.disk);
     setText(this.#warning, texts.warning);
+    this.#showReady();
     this.#sound(facts.hasNewLosses, recording?.error ?? "");
   }
 
@@ -127,6 +238,10 @@ export class RecordBar {
   #setState(state) {
     const before = this.#shown;
     this.#shown = state;
+    if (state !== "idle") {
+      // Another page was quicker.
+      this.cancelCountdown();
+    }
     if (before !== state) {
       setState(this.#bar, state);
       setState(this.#state, state);
@@ -145,7 +260,9 @@ export class RecordBar {
 
   #enable() {
     const isRecording = this.#shown === "recording";
-    setText(this.#button, isRecording ? "Stop" : "Start");
+    const left = this.#countdown.left;
+    setText(this.#button, left > 0 ? `Cancel (${left})` : isRecording ? "Stop" : "Start");
+    this.#bar.classList.toggle("is-counting", left > 0);
     this.#button.disabled = !this.#isReady;
     this.#addNote.disabled = !this.#isLive || !isRecording;
     this.#scene.disabled = isRecording;
@@ -168,9 +285,24 @@ export class RecordBar {
     this.#offerScenes(scenes);
   }
 
-  #stop() {
+  /**
+   * @param {import("./paneltypes.js").Mark} mark
+   * @returns {Promise<boolean>} whether it was done
+   */
+  async stop(mark) {
+    if (!this.#isReady || this.#shown !== "recording") {
+      return false;
+    }
     this.#setState("closing");
-    return this.#ask("stop", "/v1/record/stop", {});
+    return this.#ask("stop", "/v1/record/stop", mark === null ? {} : { mark });
+  }
+
+  /**
+   * @param {string} text
+   * @returns {Promise<boolean>} whether it was done
+   */
+  noteText(text) {
+    return this.#ask(null, "/v1/record/note", { text });
   }
 
   async #note() {
@@ -178,7 +310,7 @@ export class RecordBar {
     if (text === "" || this.#shown !== "recording") {
       return;
     }
-    if (await this.#ask(null, "/v1/record/note", { text })) {
+    if (await this.noteText(text)) {
       this.#notes.value = "";
       this.#notes.blur();
       announce("Note added");
@@ -211,7 +343,7 @@ export class RecordBar {
     } catch (error) {
       const isFull = error instanceof ApiError && error.kind === "no_space";
       this.#force.hidden = !(isFull && request === "start");
-      setText(this.#error, error instanceof Error ? error.message : String(error));
+      setText(this.#error, messageOf(error));
       play("error");
       return false;
     } finally {

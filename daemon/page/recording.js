@@ -32,12 +32,21 @@ export function isOlder(answer, status) {
   return status.recording !== null && status.recording.path === answer.path && status.recording.active;
 }
 
+/**
+ * @param {RecordingStatus} recording
+ * @param {boolean} isStopping
+ * @returns {RecordState}
+ */
+function stateOf(recording, isStopping) {
+  if (!recording.active) {
+    return "idle";
+  }
+  return isStopping || recording.closing ? "closing" : "recording";
+}
+
 export class RecordingWatch {
   /** The recording that the numbers are of: its folder. */
   #path = "";
-  #duration = -1;
-  #utcNs = 0;
-  #hasSeenClosing = false;
   #lost = 0;
   /** @type {import("./words.js").Losses} */
   #framesBefore = {};
@@ -59,7 +68,7 @@ export class RecordingWatch {
     if (recording === null) {
       return { state: "idle", bytesPerSecond: null, sets: {}, frames: {}, hasNewLosses: false };
     }
-    const state = this.#stateOf(recording, status.utc_ns, isStopping);
+    const state = stateOf(recording, isStopping);
     const frames = recording.active ? lossesSince(framesNow, this.#framesBefore) : {};
     const lost = total(recording.dropped) + total(frames);
     const hasNewLosses = recording.active && !isNew && lost > this.#lost;
@@ -74,33 +83,9 @@ export class RecordingWatch {
    */
   #begin(recording, framesNow) {
     this.#path = recording?.path ?? "";
-    this.#duration = -1;
-    this.#hasSeenClosing = false;
     this.#lost = 0;
     this.#framesBefore = framesNow;
     this.#samples = [];
-  }
-
-  /**
-   * Another client's stop shows only in this: the recording is active, and its time stands still.
-   *
-   * @param {RecordingStatus} recording
-   * @param {number} utcNs
-   * @param {boolean} isStopping
-   * @returns {RecordState}
-   */
-  #stateOf(recording, utcNs, isStopping) {
-    const stands = recording.duration_s === this.#duration && utcNs !== this.#utcNs;
-    if (recording.duration_s !== this.#duration) {
-      this.#hasSeenClosing = false;
-    }
-    this.#hasSeenClosing ||= stands;
-    this.#duration = recording.duration_s;
-    this.#utcNs = utcNs;
-    if (!recording.active) {
-      return "idle";
-    }
-    return isStopping || this.#hasSeenClosing ? "closing" : "recording";
   }
 
   /**

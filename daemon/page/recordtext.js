@@ -1,5 +1,6 @@
 /** How a recording stands, in words: pure functions. */
 
+import { lossAdvice } from "./advice.js";
 import { clock, disk, lossesInWords, size } from "./words.js";
 
 /** @typedef {import("./types.js").RecordingStatus} RecordingStatus */
@@ -9,6 +10,7 @@ import { clock, disk, lossesInWords, size } from "./words.js";
  * @typedef {Object} RecordTexts
  * @property {string} progress
  * @property {string} losses
+ * @property {string} advice what to do about them
  * @property {boolean} hasLosses
  * @property {string} disk
  * @property {string} warning
@@ -21,13 +23,14 @@ import { clock, disk, lossesInWords, size } from "./words.js";
  */
 export function recordTexts(recording, facts) {
   if (recording === null) {
-    return { progress: "Nothing recorded yet", losses: "", hasLosses: false, disk: "", warning: "" };
+    return { progress: "Nothing recorded yet", losses: "", advice: "", hasLosses: false, disk: "", warning: "" };
   }
   const losses = [lossesInWords("set", facts.sets), lossesInWords("frame", facts.frames)].filter((text) => text !== "");
   const secondsLeft = recording.active ? recording.disk_seconds_left : null;
   return {
     progress: progressOf(recording, facts),
     losses: losses.join("; ") || "No losses",
+    advice: lossAdvice(facts.sets, facts.frames),
     hasLosses: losses.length > 0,
     disk: `Disk: ${disk(recording.disk_free_bytes, secondsLeft)}`,
     warning: [recording.error, recording.warning].filter(Boolean).join("; "),

@@ -6,6 +6,12 @@ import { play } from "./sound.js";
 import { clock } from "./words.js";
 
 /** @typedef {import("./types.js").ReplayStatus} ReplayStatus */
+/** @typedef {"pause" | "resume" | "seek" | "step" | "rate" | "loop"} ReplayCommand */
+
+/** A dataset beside the live rig is steered over its connection, which answers with the next status. */
+const ANSWER_MS = 150;
+/** A status that was sent before the seek must not move the slider back. */
+const SETTLE_MS = 700;
 
 export class ReplayBar {
   #bar = byId("replay", HTMLElement);
@@ -21,8 +27,20 @@ export class ReplayBar {
   /** @type {number | null} the newest set asked for while a seek is answered */
   #wantedSet = null;
   #isHeld = false;
+  #soughtAt = -Infinity;
+  #name = byId("replay-dataset", HTMLElement);
+  #back = byId("back-to-live", HTMLButtonElement);
+  /** @type {string | null} the dataset that is shown beside the live rig */
+  #dataset = null;
+  #steer;
 
-  constructor() {
+  /**
+   * @param {(command: ReplayCommand, body: Record<string, unknown>) => void} steer a dataset beside the live rig
+   * @param {() => void} onBack
+   */
+  constructor(steer, onBack) {
+    this.#steer = steer;
+    this.#back.addEventListener("click", onBack);
     this.#pause.addEventListener("click", () => this.togglePause());
     byId("replay-back", HTMLButtonElement).addEventListener("click", () => this.step(-1));
     byId("replay-forward", HTMLButtonElement).addEventListener("click", () => this.step(1));
@@ -52,9 +70,17 @@ export class ReplayBar {
     return ((status.length_sets - 1) / status.length_s) * status.rate;
   }
 
-  /** @param {boolean} isReplay */
-  show(isReplay) {
+  /**
+   * @param {boolean} isReplay
+   * @param {string | null} dataset that is shown beside the live rig
+   */
+  show(isReplay, dataset) {
+    this.#dataset = dataset;
+    this.#status = null;
     this.#bar.hidden = !isReplay;
+    this.#back.hidden = dataset === null;
+    setText(this.#name, dataset ?? "");
+    setText(this.#message, "");
     document.body.classList.toggle("is-replay", isReplay);
   }
 
@@ -81,7 +107,8 @@ export class ReplayBar {
     setText(this.#position, where + paused);
     this.#scrub.max = String(Math.max(0, status.length_sets - 1));
     // The slider belongs to the hand that holds it.
-    if (!this.#isHeld && !this.#isSeeking) {
+    const isSettled = performance.now() - this.#soughtAt > SETTLE_MS;
+    if (!this.#isHeld && !this.#isSeeking && isSettled) {
       this.#scrub.value = String(set);
     }
     this.#scrub.setAttribute("aria-valuetext", where);
@@ -124,14 +151,20 @@ export class ReplayBar {
       this.#wantedSet = null;
       await this.#ask("seek", { set: wanted });
     }
+    this.#soughtAt = this.#dataset === null ? -Infinity : performance.now();
     this.#isSeeking = false;
   }
 
   /**
-   * @param {"pause" | "resume" | "seek" | "step" | "rate" | "loop"} command
+   * @param {ReplayCommand} command
    * @param {Record<string, unknown>} body
    */
   async #ask(command, body) {
+    if (this.#dataset !== null) {
+      this.#steer(command, body);
+      await new Promise((answered) => setTimeout(answered, ANSWER_MS));
+      return;
+    }
     try {
       const status = /** @type {ReplayStatus} */ (await post(`/v1/replay/${command}`, body));
       setText(this.#message, "");

@@ -2,7 +2,7 @@
 
 import { byId, setText, store, stored } from "./dom.js";
 
-/** @typedef {"start" | "stop" | "error" | "loss"} Cue */
+/** @typedef {"start" | "stop" | "error" | "loss" | "count" | "mark"} Cue */
 /** @typedef {{hz: number, startS: number, lengthS: number, shape: OscillatorType}} Tone */
 
 const MUTE_KEY = "depthrig-mute";
@@ -22,6 +22,8 @@ const CUES = {
     { hz: 196, startS: 0, lengthS: 0.2, shape: "square" },
     { hz: 196, startS: 0.28, lengthS: 0.3, shape: "square" },
   ],
+  count: [{ hz: 660, startS: 0, lengthS: 0.1, shape: "sine" }],
+  mark: [{ hz: 988, startS: 0, lengthS: 0.08, shape: "sine" }],
   loss: [{ hz: 1175, startS: 0, lengthS: 0.08, shape: "triangle" }],
 };
 

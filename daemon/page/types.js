@@ -21,9 +21,21 @@
  * @property {string[]} [warnings]
  * @property {number} reconnects
  * @property {StreamStatus[]} streams
+ * @property {MountStatus | null} [mount] the calibration that it has
+ *
+ * @typedef {Object} MountStatus
+ * @property {string} created
+ * @property {number | null} age_days
+ * @property {string} worth
+ * @property {number} sigma_mm
+ * @property {number} sigma_deg
+ * @property {number} rms_px
+ * @property {number} projection_worst_px
+ * @property {string[]} warnings
  *
  * @typedef {Object} RecordingStatus
  * @property {boolean} active
+ * @property {boolean} [closing] while it is being closed
  * @property {string} path
  * @property {string} name
  * @property {string} scene
@@ -53,13 +65,21 @@
  * @property {string | null} waiting_for
  * @property {string[]} lost
  *
+ * @typedef {Object} SetStatus
+ * @property {number} nominal_hz
+ * @property {number} sent
+ * @property {number} incomplete
+ * @property {number} spread_p50_ms
+ * @property {number} [spread_p95_ms]
+ * @property {{stream: string, median_ms: number, p95_ms: number}[]} [skews] from the tick of the set
+ *
  * @typedef {Object} Status
  * @property {string} rig
  * @property {string} version
  * @property {number} utc_ns
  * @property {{share: number, error: string | null} | null} preparing
  * @property {CameraStatus[]} cameras
- * @property {{nominal_hz: number, sent: number, incomplete: number, spread_p50_ms: number}} sets
+ * @property {SetStatus} sets
  * @property {RecordingStatus | null} recording
  * @property {number} cpu_cores
  * @property {ReplayStatus | null} replay
@@ -69,6 +89,7 @@
  * @property {string} version
  * @property {string} rig
  * @property {boolean} is_replay
+ * @property {string | null} [dataset] that is shown instead of the live rig
  *
  * @typedef {{stream: string, width: number, rate_hz: number, measure?: boolean}} Watch
  *

@@ -130,6 +130,12 @@ export class Wall {
     this.askWatch();
   }
 
+  /** Takes every tile away: what comes next are the images of something else. */
+  clear() {
+    this.build([]);
+    this.#built = "";
+  }
+
   /** Asks for what is visible, once for all changes of this moment. */
   askWatch() {
     if (!this.#isWatchAsked) {

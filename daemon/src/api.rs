@@ -7,7 +7,7 @@
 //! **Who may call.** The socket has mode 0600 in a folder of mode 0700: the user that runs the rig. A port must be
 //! loopback and is open to every user of the computer, so its requests carry a token that only that user can read (file
 //! `RIG.token` beside the socket); `/metrics` and the files of the live page need none, and the
-//! page's WebSocket has it in its first message. Web pages in that user's browser are kept out by three rules: the `Host` must be a loopback name (against
+//! page's WebSocket has it in its first message, viewers with Foxglove's protocol, which have a port of their own, in the path of their address. Web pages in that user's browser are kept out by three rules: the `Host` must be a loopback name (against
 //! DNS rebinding), an `Origin` must be this server's (against WebSockets from other pages), and a POST must be `application/json`, which a page
 //! of another origin may not send without asking first, and nobody answers that question (against CSRF).
 //!
@@ -16,11 +16,14 @@
 
 mod allowed;
 mod events;
+mod foxglove;
 mod guard;
 mod limits;
 mod live;
 mod page;
+mod recordings;
 mod reply;
+mod requests;
 mod routes;
 mod serve;
 mod socket;
@@ -28,14 +31,14 @@ mod token;
 
 pub use events::{CaptureEvent, MAX_FOLLOWERS};
 pub use page::PageAddress;
+pub use recordings::{MarkRequest, NameRequest, Recording, Recordings, ReportPage};
 pub(crate) use reply::{ErrorBody, kind_of_name};
-pub use routes::{
-    Health, HealthReason, LoopRequest, NoteRequest, OPENAPI, ROUTES, RateRequest, Route, StepRequest,
-};
+pub use requests::{CameraRequest, FingerprintRequest, LoopRequest, NoteRequest, RateRequest, StepRequest};
+pub use routes::{Health, HealthReason, OPENAPI, ROUTES, Route};
 pub use serve::ServerHandle;
 
 use crate::Result;
-use crate::config::Port;
+use crate::config::ControlConfig;
 use crate::control::Control;
 use depthrig_bus::{RigName, RuntimeDir};
 use std::sync::Arc;
@@ -47,7 +50,7 @@ pub const MAX_CONNECTIONS: usize = 64;
 /// The header of every answer that names the server: `depthrig/0.1.0`.
 pub const SERVER_HEADER: &str = "server";
 
-/// Serves `control`, and the images of its rig, on the rig's Unix socket below `runtime` and on a loopback port.
+/// Serves `control`, and the images of its rig, on the rig's Unix socket below `runtime` and on loopback ports.
 ///
 /// The caller holds the rig's lock: only then is a socket file that is already there the rest of a process that
 /// died, and removed. It returns when both accept connections; dropping the handle ends the service.
@@ -59,7 +62,7 @@ pub fn serve(
     control: Arc<dyn Control>,
     runtime: &RuntimeDir,
     rig: &RigName,
-    port: Port,
+    ports: ControlConfig,
 ) -> Result<ServerHandle> {
-    ServerHandle::start(control, runtime, rig, port)
+    ServerHandle::start(control, runtime, rig, ports)
 }

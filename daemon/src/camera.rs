@@ -9,10 +9,12 @@ use crate::wake::Wake;
 use depthrig_bus::sync::lock;
 use depthrig_bus::{Bus, HostTime, Pose, StreamId};
 use depthrig_driver::DeviceInfo;
+use depthrig_driver::controls::{ControlPanel, ControlValue};
 use depthrig_recorder::Computed;
 use depthrig_sim::synthetic::Drawing;
 use depthrig_stereo::{Descriptions, Notice, PREFIXES, SIDES};
-use std::sync::{Arc, Mutex, MutexGuard};
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, Weak};
 
 mod calibration;
 pub(crate) use calibration::status as calibration_status;
@@ -22,7 +24,6 @@ mod supervisor;
 pub use supervisor::Supervisor;
 
 /// A camera and the state of its supervisor.
-#[derive(Debug)]
 pub struct Camera {
     /// Its part of the configuration.
     pub config: CameraConfig,
@@ -30,11 +31,12 @@ pub struct Camera {
     pub computed: Descriptions,
     /// A problem with its stereo images although it streams.
     pub notice: Notice,
+    /// Controls that were changed while it ran, with their values, by key. It has them again when it comes back.
+    pub changed: Mutex<BTreeMap<String, ControlValue>>,
     state: Mutex<State>,
 }
 
 /// The present state of a camera.
-#[derive(Debug)]
 pub struct State {
     /// Where its supervisor stands.
     pub phase: CameraState,
@@ -52,6 +54,8 @@ pub struct State {
     pub streams: Vec<Arc<Stream>>,
     /// The computed ones.
     pub derived: Vec<Arc<Stream>>,
+    /// The controls of the running device.
+    pub panel: Option<Weak<dyn ControlPanel>>,
     /// Refinement of its depth.
     pub refinement: Option<Arc<Refinement>>,
     /// Bytes of one frame of every stream, once it was open.
@@ -74,6 +78,7 @@ impl Camera {
             info: None,
             streams: Vec::new(),
             derived: Vec::new(),
+            panel: None,
             refinement: None,
             set_bytes: 0,
             short_of_memory: false,
@@ -83,6 +88,7 @@ impl Camera {
             config,
             computed: Descriptions::default(),
             notice: Notice::default(),
+            changed: Mutex::default(),
             state: Mutex::new(state),
         }
     }

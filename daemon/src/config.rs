@@ -130,10 +130,12 @@ pub struct RecordingConfig {
 }
 
 /// The control API. The Unix socket is always there.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ControlConfig {
     /// Where the API and the live page are also served, for this computer alone.
     pub tcp: Port,
+    /// Where viewers that speak Foxglove's protocol are served, for this computer alone.
+    pub foxglove: Port,
 }
 
 /// A port on the loopback interface.
@@ -151,6 +153,13 @@ pub enum Port {
 impl Port {
     /// Where the live page is if nothing else is configured.
     pub const DEFAULT: SocketAddr = SocketAddr::V4(SocketAddrV4::new(Ipv4Addr::LOCALHOST, 8642));
+    /// The port that viewers with Foxglove's protocol propose.
+    pub const FOXGLOVE: u16 = 8765;
+
+    /// A port of the loopback interface.
+    pub const fn loopback(port: u16) -> Self {
+        Self::At(SocketAddr::V4(SocketAddrV4::new(Ipv4Addr::LOCALHOST, port)))
+    }
 }
 
 /// Supervision of the cameras.
@@ -268,6 +277,12 @@ impl Default for RecordingConfig {
             min_minutes: 1,
             recover_on_start: true,
         }
+    }
+}
+
+impl Default for ControlConfig {
+    fn default() -> Self {
+        Self { tcp: Port::Any, foxglove: Port::Off }
     }
 }
 

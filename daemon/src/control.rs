@@ -1,9 +1,14 @@
 //! Calls on a running rig, from any side: the HTTP API, the command line in process, or a test.
 
-use crate::Result;
+use crate::doctor::Examined;
 use crate::status::{RecordingStatus, ReplayStatus, RigStatus};
+use crate::{Error, ErrorKind, Result};
+use depthrig_bus::{RigName, RuntimeDir, UtcPair};
+use depthrig_driver::controls::ControlValue;
+use depthrig_recorder::{Mark, RecorderOptions, Session};
 use serde::{Deserialize, Serialize};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// A running rig, as its control sees it. Every call returns quickly; `record_stop` may take as long as the
 /// disk needs for the sets that are still queued.
@@ -19,6 +24,61 @@ pub trait Control: Send + Sync {
         Vec::new()
     }
 
+    /// The folder that recordings go into.
+    ///
+    /// # Errors
+    /// `WrongState` of a rig that has none.
+    fn recordings(&self) -> Result<PathBuf> {
+        Err(Error::new(ErrorKind::WrongState, "this rig replays datasets and has no folder of recordings"))
+    }
+    /// Shows datasets beside the rig, if it can.
+    fn shows(&self) -> Option<&dyn Shows> {
+        None
+    }
+    /// Examines the rig's cameras, their links, memory and disk, without measuring the disk.
+    ///
+    /// # Errors
+    /// `WrongState` of a rig without cameras, and when the system cannot be read at all.
+    fn doctor(&self) -> Result<Examined> {
+        Err(Error::new(ErrorKind::WrongState, "this rig replays datasets and has no cameras to examine"))
+    }
+    /// The controls of the cameras that can be changed while they stream.
+    ///
+    /// # Errors
+    /// `WrongState` of a rig without cameras, `Other` when the rig file cannot be read any more.
+    fn controls(&self) -> Result<ControlList> {
+        Err(no_controls())
+    }
+    /// Changes a control of a running camera; no file changes. A recording gets a note.
+    ///
+    /// # Errors
+    /// `NotFound` for an unknown camera, `WrongState` for one whose controls cannot be changed now, `BadInput` for an unknown control or a
+    /// value that it does not take, `Other` when the camera refuses.
+    fn set_control(&self, _: &ControlRequest) -> Result<CameraControls> {
+        Err(no_controls())
+    }
+    /// Sets the controls of a camera that were changed back to the rig file's values, and those that it does not have to what they are after
+    /// power-on.
+    ///
+    /// # Errors
+    /// As [`Self::set_control`].
+    fn revert_controls(&self, _camera: &str) -> Result<CameraControls> {
+        Err(no_controls())
+    }
+    /// Previews how the rig file changes when the changed controls are written into it.
+    ///
+    /// # Errors
+    /// `WrongState` for a rig without a file, `Other` when it cannot be read or edited as text.
+    fn control_changes(&self) -> Result<ControlChanges> {
+        Err(no_controls())
+    }
+    /// Writes the changed controls into the rig file, if that does what `fingerprint` stands for.
+    ///
+    /// # Errors
+    /// As [`Self::control_changes`]; `WrongState` when the file or a control has changed since, `PermissionDenied`, `NoSpace`.
+    fn save_controls(&self, _fingerprint: &str) -> Result<ControlChanges> {
+        Err(no_controls())
+    }
     /// Starts a recording.
     ///
     /// # Errors
@@ -41,10 +101,130 @@ pub trait Control: Send + Sync {
     /// Asks the daemon to end.
     fn request_stop(&self);
 
+    /// The streams of the rig now, for viewers of its live channels; `None` for a rig without channels.
+    fn live(&self) -> Option<LiveRig> {
+        None
+    }
+
     /// The controls of the replay, when the rig is one.
     fn replay(&self) -> Option<&dyn ReplayControl> {
         None
     }
+}
+
+fn no_controls() -> Error {
+    Error::new(ErrorKind::WrongState, "this rig replays datasets and has no cameras to control")
+}
+
+/// The controls of a rig's cameras.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ControlList {
+    /// The rig file; `None` for the built-in configuration.
+    pub file: Option<PathBuf>,
+    /// In the order of the rig file.
+    pub cameras: Vec<CameraControls>,
+}
+
+/// The controls of a camera.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct CameraControls {
+    /// Its name.
+    pub camera: String,
+    /// Why it has no controls.
+    pub problem: Option<String>,
+    /// Those that can be changed while it streams.
+    pub controls: Vec<ControlInfo>,
+}
+
+/// A control.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ControlInfo {
+    /// Where it is in the camera's table of the rig file: `gain`, or `color_controls.brightness`.
+    pub name: String,
+    /// `integer`, `boolean` or `menu`.
+    pub kind: &'static str,
+    /// The least value.
+    pub minimum: i64,
+    /// The greatest value.
+    pub maximum: i64,
+    /// The distance between values.
+    pub step: u64,
+    /// The value after power-on.
+    pub default: Option<ControlValue>,
+    /// The items of a menu.
+    pub items: Vec<ControlItem>,
+    /// The value now; `None` when it cannot be read.
+    pub value: Option<ControlValue>,
+    /// The rig file's value; `None` where it leaves the control alone.
+    pub in_file: Option<ControlValue>,
+    /// Whether it has an effect now: an automatic may have it.
+    pub is_active: bool,
+    /// Whether it cannot be changed at all.
+    pub is_read_only: bool,
+}
+
+/// An item of a menu.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct ControlItem {
+    /// Its number.
+    pub value: i64,
+    /// Its name.
+    pub name: String,
+}
+
+/// A change of a control.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ControlRequest {
+    /// The camera.
+    pub camera: String,
+    /// The control, as the list names it.
+    pub name: String,
+    /// Its new value.
+    pub value: ControlValue,
+}
+
+/// Changes of a rig file that have not been made.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct ControlChanges {
+    /// The rig file.
+    pub file: PathBuf,
+    /// A unified diff; empty if nothing differs.
+    pub diff: String,
+    /// Stands for the file as it is and for the change.
+    pub fingerprint: String,
+}
+
+/// Shows datasets beside a rig, as rigs of their own that no other program sees.
+pub trait Shows: Send + Sync {
+    /// Shows the dataset in the folder `dataset` until the answer is dropped; the same one for all who ask for the same dataset.
+    ///
+    /// # Errors
+    /// `NotFound`, `BadInput` for what is not a dataset, `InUse` while another one is shown, `NoSpace` when shared memory is too small.
+    fn show(&self, dataset: &Path) -> Result<Arc<Shown>>;
+}
+
+/// A dataset that is shown.
+pub struct Shown {
+    /// Its control, a replay's.
+    pub control: Arc<dyn Control>,
+    /// Where its channels are.
+    pub runtime: RuntimeDir,
+    /// The rig's name there.
+    pub rig: RigName,
+    /// Ends it when dropped.
+    pub replay: Box<dyn Send + Sync>,
+}
+
+/// The streams of a rig as a recording that began now would list them, those included that are not recorded.
+#[derive(Debug, Clone)]
+pub struct LiveRig {
+    /// The streams and IMUs.
+    pub session: Session,
+    /// How their images are stored.
+    pub options: RecorderOptions,
+    /// Both clocks of their times: in a replay those of the dataset.
+    pub utc: UtcPair,
 }
 
 /// Calls on a replay. A call that publishes a set returns when that was done, or after 3 s.
@@ -101,6 +281,14 @@ pub struct SeekRequest {
     pub set: Option<u64>,
     /// The set with this id in the only dataset.
     pub id: Option<u64>,
+}
+
+/// How a recording ends.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct StopRequest {
+    /// A judgement of it.
+    pub mark: Option<Mark>,
 }
 
 /// Options of a recording.

@@ -62,15 +62,33 @@ pub struct Surroundings {
     pub measure_disk: bool,
 }
 
+/// The findings, and everything that is attached.
+#[derive(Debug, Clone, Serialize)]
+pub struct Examined {
+    /// The findings.
+    #[serde(flatten)]
+    pub report: Report,
+    /// Everything attached, of the rig or not.
+    pub attached: Attached,
+}
+
 /// Examines a session of `config`.
 ///
 /// # Errors
 /// When the bus cannot be read at all.
 pub fn examine(config: &RigConfig, around: &Surroundings, ask: &dyn Ask) -> crate::Result<Report> {
+    examine_all(config, around, ask).map(|examined| examined.report)
+}
+
+/// As [`examine`], with what is attached.
+///
+/// # Errors
+/// As [`examine`].
+pub fn examine_all(config: &RigConfig, around: &Surroundings, ask: &dyn Ask) -> crate::Result<Examined> {
     let attached = look(&around.root, ask)?;
     let plans = cameras::plan(config, &attached);
     let host = Host::gather(config, around, plans.iter().map(|p| &p.plan));
-    Ok(judge(config, &attached, plans, &host))
+    Ok(Examined { report: judge(config, &attached, plans, &host), attached })
 }
 
 /// Judges the gathered facts.

@@ -41,6 +41,21 @@ impl From<depthrig_bus::Error> for Error {
     }
 }
 
+impl From<depthrig_recorder::Error> for Error {
+    fn from(e: depthrig_recorder::Error) -> Self {
+        use depthrig_recorder::ErrorKind as Rec;
+        let kind = match e.kind() {
+            Rec::NotFound | Rec::NotADataset => ErrorKind::NotFound,
+            Rec::PermissionDenied => ErrorKind::PermissionDenied,
+            Rec::InUse => ErrorKind::InUse,
+            Rec::DiskFull => ErrorKind::NoSpace,
+            Rec::AlreadyExists | Rec::BadInput => ErrorKind::BadInput,
+            _ => ErrorKind::Other,
+        };
+        Self::new(kind, e.to_string()).with_source(e)
+    }
+}
+
 impl From<depthrig_driver::Error> for Error {
     fn from(e: depthrig_driver::Error) -> Self {
         use depthrig_driver::ErrorKind as Driver;

@@ -1,7 +1,7 @@
 //! Recording under control of the daemon: start, stop, notes, and the numbers that go with it.
 
 use crate::config::{RecordingConfig, RigConfig};
-use crate::control::RecordRequest;
+use crate::control::{LiveRig, RecordRequest};
 use crate::status::{RecordingStatus, SetAccount};
 use crate::stream::Stream;
 use crate::{Error, ErrorKind, Result};
@@ -134,9 +134,7 @@ impl Begun {
             max_spread_ns(streams.iter().map(|s| reach_ns(s, streams.iter().chain(&others), sets_hz)));
         let firmware = streams.iter().filter(|s| !s.firmware.is_empty());
         session.firmware = firmware.map(|s| (s.stream.id.camera.to_string(), s.firmware.clone())).collect();
-        session.computed = streams.iter().filter_map(|s| s.computed.clone()).collect();
-        session.streams = streams.iter().map(facts::record_of).collect();
-        session.motion = units.iter().map(motion::record_of).collect();
+        describe(&mut session, &streams, &units);
         let mut options = options_of(&config.recording);
         options.backlog_max_bytes = outside.backlog_max_bytes.unwrap_or(options.backlog_max_bytes);
         options.late_after_ns = outside.late_after_ns;
@@ -148,9 +146,9 @@ impl Begun {
         budget::check(&*outside.fs, &path, request, rate, reserve, &config.recording)?;
         let fs = Arc::clone(&outside.fs);
         let clock = Arc::clone(&outside.utc);
-        let recorder = Recorder::create_with(fs, clock, &path, session, options).map_err(of_recorder)?;
+        let recorder = Recorder::create_with(fs, clock, &path, session, options).map_err(Error::from)?;
         if !request.notes.is_empty() {
-            recorder.add_note(request.notes.as_str()).map_err(of_recorder)?;
+            recorder.add_note(request.notes.as_str()).map_err(Error::from)?;
         }
         tracing::info!(path = %path.display(), streams = streams.len(), imus = units.len(), "recording");
         let status = RecordingStatus {
@@ -183,6 +181,22 @@ impl Begun {
             status,
         }))
     }
+}
+
+/// Lists streams and IMUs.
+fn describe(session: &mut Session, streams: &[StreamFacts], units: &[StreamFacts]) {
+    session.computed = streams.iter().filter_map(|s| s.computed.clone()).collect();
+    session.streams = streams.iter().map(facts::record_of).collect();
+    session.motion = units.iter().map(motion::record_of).collect();
+}
+
+/// The streams of a rig for viewers of its live channels, with its clocks.
+pub fn live_rig(config: &RigConfig, streams: Vec<StreamFacts>, utc: UtcPair) -> LiveRig {
+    let (units, streams): (Vec<_>, Vec<_>) =
+        streams.into_iter().partition(|s| s.stream.profile.format.is_motion());
+    let mut session = Session::new("live", config.rig.as_str());
+    describe(&mut session, &streams, &units);
+    LiveRig { session, options: options_of(&config.recording), utc }
 }
 
 impl Recording {
@@ -272,7 +286,7 @@ impl Recording {
         if text.trim().is_empty() {
             return Err(Error::new(ErrorKind::BadInput, "the note is empty"));
         }
-        active.recorder.add_note(text).map_err(of_recorder)
+        active.recorder.add_note(text).map_err(Error::from)
     }
 
     /// Takes the recorder out, to be finished without keeping others waiting.
@@ -284,6 +298,9 @@ impl Recording {
         let mut active = self.active.take().ok_or_else(none_active)?;
         self.motion.end(&mut active.motion);
         active.hand_over_accounts();
+        if let Some(last) = &mut self.last {
+            last.closing = true;
+        }
         Ok(Finishing { active })
     }
 
@@ -406,7 +423,7 @@ impl Finishing {
             Err(e) => {
                 status.error = Some(e.to_string());
                 tracing::error!(path = status.path, error = %e, "the recording could not be closed");
-                (status, Err(of_recorder(e)))
+                (status, Err(e.into()))
             }
         }
     }
@@ -448,17 +465,6 @@ fn finish(recording: &Mutex<Recording>, finishing: Finishing) -> Result<Recordin
 
 fn none_active() -> Error {
     Error::new(ErrorKind::WrongState, "no recording is going on; start one with: depthrig record start")
-}
-
-fn of_recorder(e: depthrig_recorder::Error) -> Error {
-    use depthrig_recorder::ErrorKind as Rec;
-    let kind = match e.kind() {
-        Rec::DiskFull => ErrorKind::NoSpace,
-        Rec::PermissionDenied => ErrorKind::PermissionDenied,
-        Rec::AlreadyExists | Rec::BadInput => ErrorKind::BadInput,
-        _ => ErrorKind::Other,
-    };
-    Error::new(kind, e.to_string()).with_source(e)
 }
 
 /// Bytes of its disk that a recording never uses.

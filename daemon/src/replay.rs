@@ -37,7 +37,7 @@ use crate::stage::{Intake, Refinement, Stage};
 use crate::status::{RecordingStatus, ReplayStatus};
 use crate::stream::Stream;
 use crate::wake::Wake;
-use crate::{Error, ErrorKind, Result};
+use crate::{Error, ErrorKind, Result, priority};
 use core::time::Duration;
 use depthrig_bus::runtime::RigLock;
 use depthrig_bus::sync::lock;
@@ -80,8 +80,12 @@ pub struct ReplayOptions {
     pub hold: bool,
     /// Refine the depth of its cameras with this engine, as a rig does; not with `as_fast_as_possible`.
     pub refine: Option<EngineChoice>,
+    /// Give way to everything else: threads of low priority, and the least shared memory.
+    pub in_background: bool,
     /// Whether to serve the control API.
     pub serve_api: bool,
+    /// Where Foxglove finds it, beside the control API.
+    pub foxglove: Port,
 }
 
 impl Default for ReplayOptions {
@@ -95,7 +99,9 @@ impl Default for ReplayOptions {
             paused: false,
             hold: false,
             refine: None,
+            in_background: false,
             serve_api: false,
+            foxglove: Port::Off,
         }
     }
 }
@@ -212,8 +218,8 @@ impl Replay {
             options.refine.map(|engine| refine::refinements(&inner, &bus, engine)).transpose()?;
         let mut replay = Self { inner, threads: Vec::new(), api: None, _lock: held };
         if options.serve_api {
-            let port = replay.inner.config.control.tcp;
-            replay.api = Some(api::serve(replay.control(), runtime, &rig, port)?);
+            let ports = ControlConfig { foxglove: options.foxglove, ..replay.inner.config.control };
+            replay.api = Some(api::serve(replay.control(), runtime, &rig, ports)?);
         }
         let inner = Arc::clone(&replay.inner);
         replay.spawn("housekeeping", move || housekeeping(&inner, &bus))?;
@@ -226,7 +232,12 @@ impl Replay {
             *lock(&inner.refinements) = refinements;
             replay.spawn("stage", move || stage.run(&inner.stop))?;
         }
-        replay.spawn("replay", move || player.run())?;
+        replay.spawn("replay", move || {
+            if options.in_background {
+                priority::lower_current_thread();
+            }
+            player.run();
+        })?;
         Ok(replay)
     }
 
@@ -317,7 +328,7 @@ fn recording_config(sources: &mut Sources) -> RigConfig {
         bus: BusConfig::default(),
         sets: SetsConfig::default(),
         recording,
-        control: ControlConfig { tcp: Port::Any },
+        control: ControlConfig::default(),
         supervisor: SupervisorConfig::default(),
         cdm: CdmConfig::default(),
         calibration: None,
@@ -325,6 +336,18 @@ fn recording_config(sources: &mut Sources) -> RigConfig {
         cameras: Vec::new(),
         text: sources.session().rig_config.clone(),
         path: None,
+    }
+}
+
+/// Slots that each stream gets when there is memory for them.
+const fn slots(options: &ReplayOptions) -> usize {
+    if options.as_fast_as_possible {
+        SUBSCRIBER_BUFFER
+    } else if options.in_background {
+        // What one subscriber leaves unread, the frame it shows and the one it takes, and one to write into.
+        SUBSCRIBER_BUFFER + 4
+    } else {
+        shm::DEFAULT_SLOTS
     }
 }
 
@@ -336,7 +359,7 @@ impl Inner {
         timeline: Arc<Timeline>,
         sources: Sources,
     ) -> Self {
-        let slots = if options.as_fast_as_possible { SUBSCRIBER_BUFFER } else { shm::DEFAULT_SLOTS };
+        let slots = slots(&options);
         let stream = |r: &StreamRecord| Arc::new(Stream::new(r.id.clone(), profile(r), true, slots));
         let unit = |r: &MotionRecord| Arc::new(Stream::new(r.id.clone(), unit_profile(r), true, slots));
         let begin = Begin {
@@ -390,7 +413,7 @@ impl Inner {
 
     /// Slots that each stream gets when there is memory for them.
     const fn slots(&self) -> usize {
-        if self.lossless() { SUBSCRIBER_BUFFER } else { shm::DEFAULT_SLOTS }
+        slots(&self.options)
     }
 
     fn stopping(&self) -> bool {

@@ -10,14 +10,19 @@
 //! ```
 
 mod assembly;
+mod controls;
 mod join;
 mod motion;
 pub(crate) mod report;
 
 use crate::api::{self, ServerHandle};
+use crate::attached::System;
 use crate::camera::{Camera, Shared, Supervisor};
 use crate::config::RigConfig;
-use crate::control::{Control, RecordRequest};
+use crate::control::{
+    CameraControls, Control, ControlChanges, ControlList, ControlRequest, LiveRig, RecordRequest, Shows,
+};
+use crate::doctor::{self, Surroundings};
 use crate::family::Preparation;
 use crate::housekeeping::Housekeeping;
 use crate::recording::{self, Begun, Outside, Recording, Reports, StreamFacts, recover_left};
@@ -35,6 +40,7 @@ use depthrig_cdm::stage::{Installed, Refiners};
 use depthrig_recorder::fs::{Fs, RealFs};
 use depthrig_recorder::{UtcSource, live_late_ns};
 use depthrig_sim::synthetic::{Drawing, DrawingProgress};
+use depthrig_usb::SysRoot;
 pub use join::near_pair_ns;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -76,6 +82,8 @@ pub struct RigOptions {
     /// Source of refiners; tests put something that fails or hangs here. The engines and models of this
     /// computer when `None`.
     pub refiners: Option<Arc<dyn Refiners>>,
+    /// Shows datasets on the live page; without it the page has the cameras alone.
+    pub shows: Option<Arc<dyn Shows>>,
     /// Simulated cameras stream before their scenes are rendered, with coarse images until then.
     pub draw_while_running: bool,
 }
@@ -92,6 +100,7 @@ impl RigOptions {
             utc: Arc::new(UtcPair::sample),
             backlog_max_bytes: None,
             refiners: None,
+            shows: None,
             draw_while_running: false,
         }
     }
@@ -134,10 +143,15 @@ pub struct Inner {
     outside: Outside,
     starting: Mutex<()>,
     spreads: Mutex<SpreadStats>,
+    /// Of each stream, in the order of the cameras.
+    skews: Mutex<BTreeMap<StreamId, SpreadStats>>,
     set_accounts: Mutex<SetAccounts>,
     cpu_millicores: AtomicU64,
     /// A recording is about to end: sets assembled from now on are not part of it.
     closing: AtomicBool,
+    /// Shows datasets on the live page.
+    shows: Option<Arc<dyn Shows>>,
+    runtime: RuntimeDir,
     /// Sets that wait for refined depth.
     held_sets: AtomicUsize,
 }
@@ -203,9 +217,12 @@ impl Rig {
             },
             starting: Mutex::default(),
             spreads: Mutex::default(),
+            skews: Mutex::default(),
             set_accounts: Mutex::default(),
             cpu_millicores: AtomicU64::new(0),
             closing: AtomicBool::new(false),
+            shows: options.shows.clone(),
+            runtime: options.runtime.clone(),
             held_sets: AtomicUsize::new(0),
         });
         let assembly = Assembly::new(Arc::clone(&inner))?;
@@ -213,7 +230,7 @@ impl Rig {
         // Before the cameras: a long start can then be asked about.
         if options.serve_api {
             let config = &rig.inner.config;
-            rig.api = Some(api::serve(rig.control(), &options.runtime, &config.rig, config.control.tcp)?);
+            rig.api = Some(api::serve(rig.control(), &options.runtime, &config.rig, config.control)?);
         }
         let inner = Arc::clone(&rig.inner);
         rig.spawn("supervisor", move |stop| supervise(&inner, stop))?;
@@ -465,6 +482,41 @@ impl Control for Inner {
         core::iter::once(&config.directory).chain(&config.allow).cloned().collect()
     }
 
+    fn recordings(&self) -> Result<PathBuf> {
+        Ok(std::path::absolute(&self.config.recording.directory)
+            .unwrap_or_else(|_| self.config.recording.directory.clone()))
+    }
+
+    fn shows(&self) -> Option<&dyn Shows> {
+        self.shows.as_deref()
+    }
+
+    fn doctor(&self) -> Result<doctor::Examined> {
+        let runtime = Some(self.runtime.clone());
+        let around = Surroundings { root: SysRoot::new("/"), runtime: runtime.clone(), measure_disk: false };
+        doctor::examine_all(&self.config, &around, &System::of_rig(&self.config, runtime))
+    }
+
+    fn controls(&self) -> Result<ControlList> {
+        controls::list(self)
+    }
+
+    fn set_control(&self, request: &ControlRequest) -> Result<CameraControls> {
+        controls::set(self, request)
+    }
+
+    fn revert_controls(&self, camera: &str) -> Result<CameraControls> {
+        controls::revert(self, camera)
+    }
+
+    fn control_changes(&self) -> Result<ControlChanges> {
+        controls::changes(self)
+    }
+
+    fn save_controls(&self, fingerprint: &str) -> Result<ControlChanges> {
+        controls::save(self, fingerprint)
+    }
+
     fn record_start(&self, request: &RecordRequest) -> Result<RecordingStatus> {
         let _one_at_a_time = lock(&self.starting);
         self.recording().must_be_idle()?;
@@ -472,7 +524,13 @@ impl Control for Inner {
         let sets_hz = self.config.sets.rate_hz;
         // Without the recording's lock: making a file must not keep the set thread waiting.
         let begun = Begun::new(&self.config, request, self.stream_facts(), sets_hz, &self.outside)?;
-        Ok(self.recording().begin(begun))
+        let status = self.recording().begin(begun);
+        if let Some(note) = controls::note(self)
+            && let Err(e) = self.recording().note(&note)
+        {
+            tracing::warn!("the recording does not say which controls were changed: {e}");
+        }
+        Ok(status)
     }
 
     fn record_stop(&self) -> Result<RecordingStatus> {
@@ -486,6 +544,11 @@ impl Control for Inner {
 
     fn record_note(&self, text: &str) -> Result<()> {
         self.recording().note(text)
+    }
+
+    fn live(&self) -> Option<LiveRig> {
+        let utc = (self.outside.utc)();
+        Some(recording::live_rig(&self.config, self.stream_facts(), utc))
     }
 
     fn request_stop(&self) {

@@ -376,6 +376,20 @@ pub struct SetStatus {
     pub spread_p99_ms: f64,
     /// Greatest.
     pub spread_max_ms: f64,
+    /// How far the frames of each stream are from the moments that the sets stand for; the difference of two streams is their skew.
+    #[serde(default)]
+    pub skews: Vec<SkewStatus>,
+}
+
+/// Capture times of a stream's frames against the ticks of their sets, over the last minutes.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct SkewStatus {
+    /// `camera/stream`.
+    pub stream: String,
+    /// Median, milliseconds; negative: before the tick.
+    pub median_ms: f64,
+    /// 95th percentile of its size, milliseconds.
+    pub p95_ms: f64,
 }
 
 /// Shared memory of the bus.
@@ -394,6 +408,9 @@ pub struct SharedMemoryStatus {
 pub struct RecordingStatus {
     /// Whether it is still going on.
     pub active: bool,
+    /// Whether it is being closed: no set is added any more, those that wait are written.
+    #[serde(default)]
+    pub closing: bool,
     /// The dataset's folder.
     pub path: String,
     /// Session name.

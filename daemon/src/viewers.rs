@@ -5,6 +5,7 @@
 //! everything that captures; it exists while somebody watches.
 
 mod geometry;
+mod newest;
 mod pixel;
 mod worker;
 
@@ -15,6 +16,7 @@ use depthrig_bus::{HostTime, RigName, RuntimeDir, StreamId};
 use depthrig_recorder::preview::{Measure, PreviewKind};
 pub(crate) use geometry::Geometry;
 use hyper::body::Bytes;
+pub(crate) use newest::{Newest, next_turn};
 pub(crate) use pixel::{PixelAnswer, PixelQuestion};
 use serde::Serialize;
 use std::collections::BTreeMap;

@@ -13,7 +13,7 @@ use depthrig_bus::clock::HostTime;
 use depthrig_bus::{RigName, RuntimeDir};
 use depthrig_daemon::api::{self, MAX_BODY_BYTES, MAX_FOLLOWERS, OPENAPI, ROUTES, ServerHandle};
 use depthrig_daemon::client::Client;
-use depthrig_daemon::config::Port;
+use depthrig_daemon::config::{ControlConfig, Port};
 use depthrig_daemon::control::{RecordRequest, SeekRequest};
 use depthrig_daemon::status::CameraState;
 use depthrig_daemon::{Error, ErrorKind};
@@ -38,6 +38,11 @@ struct Served {
     _tmp: tempfile::TempDir,
 }
 
+/// The API on this port, and nothing for Foxglove.
+fn tcp(tcp: Port) -> ControlConfig {
+    ControlConfig { tcp, ..ControlConfig::default() }
+}
+
 fn served() -> Served {
     let tmp = tempfile::Builder::new().prefix("dr").rand_bytes(4).tempdir_in("/tmp").unwrap();
     let runtime = RuntimeDir::at(tmp.path()).unwrap();
@@ -45,7 +50,7 @@ fn served() -> Served {
     let lock = runtime.lock(&rig, "process 42 (rig.toml)").unwrap();
     let fake = Arc::new(Fake::default());
     let any_port = Port::At("127.0.0.1:0".parse().unwrap());
-    let server = api::serve(fake.clone(), &runtime, &rig, any_port).unwrap();
+    let server = api::serve(fake.clone(), &runtime, &rig, tcp(any_port)).unwrap();
     Served { fake, runtime, rig, server, lock, _tmp: tmp }
 }
 
@@ -161,6 +166,24 @@ fn every_answer_of_a_live_server_fits_the_document() {
     check("GET", "/v1/health", &served.get("/v1/health"), 200);
     check("GET", "/v1/config", &served.get("/v1/config"), 200);
     check("GET", "/metrics", &served.get("/metrics"), 200);
+    // This rig has neither cameras nor a folder; tests/python/test_live_rig.py has answers of one that does.
+    for path in ["/v1/recordings", "/v1/doctor", "/v1/controls", "/v1/controls/changes"] {
+        check("GET", path, &served.get(path), 409);
+    }
+    check("GET", "/v1/recordings/image", &served.get("/v1/recordings/image?name=x"), 409);
+    check("GET", "/v1/recordings/image", &served.get("/v1/recordings/image"), 400);
+    check("GET", "/v1/report/{ticket}", &served.get("/v1/report/0123"), 404);
+    for (path, body) in [
+        ("/v1/recordings/mark", r#"{"name": "x", "mark": "bad"}"#),
+        ("/v1/recordings/report", r#"{"name": "x"}"#),
+        ("/v1/controls", r#"{"camera": "x", "name": "gain", "value": 1}"#),
+        ("/v1/controls/revert", r#"{"camera": "x"}"#),
+        ("/v1/controls/save", r#"{"fingerprint": "x"}"#),
+    ] {
+        check("POST", path, &served.post(path, body), 409);
+        check("POST", path, &served.post(path, r#"{"unknown": 1}"#), 400);
+    }
+    check("POST", "/v1/record/stop", &served.post("/v1/record/stop", r#"{"mark": "ugly"}"#), 400);
     check("GET", "/v1/page", &served.get("/v1/page"), 200);
     check("GET", "/v1/openapi.json", &served.get("/v1/openapi.json"), 200);
     for (kind, wanted) in [
@@ -449,19 +472,19 @@ fn a_dead_daemons_socket_is_replaced_and_nothing_else_is() {
     let fake: Arc<Fake> = Arc::default();
     drop(UnixListener::bind(&path).unwrap());
     assert!(path.exists(), "a socket that nobody listens on");
-    let first = api::serve(fake.clone(), &runtime, &rig, Port::Off).unwrap();
-    let e = api::serve(fake.clone(), &runtime, &rig, Port::Off).unwrap_err();
+    let first = api::serve(fake.clone(), &runtime, &rig, tcp(Port::Off)).unwrap();
+    let e = api::serve(fake.clone(), &runtime, &rig, tcp(Port::Off)).unwrap_err();
     assert_eq!(e.kind(), ErrorKind::InUse);
     assert!(e.to_string().contains("another process answers on it"), "{e}");
     // A server whose file was replaced by somebody leaves that file alone.
     std::fs::remove_file(&path).unwrap();
-    let second = api::serve(fake.clone(), &runtime, &rig, Port::Off).unwrap();
+    let second = api::serve(fake.clone(), &runtime, &rig, tcp(Port::Off)).unwrap();
     let inode = std::fs::metadata(&path).unwrap().ino();
     first.stop();
     assert_eq!(std::fs::metadata(&path).unwrap().ino(), inode);
     second.stop();
     std::fs::write(&path, "precious").unwrap();
-    let e = api::serve(fake, &runtime, &rig, Port::Off).unwrap_err();
+    let e = api::serve(fake, &runtime, &rig, tcp(Port::Off)).unwrap_err();
     assert!(e.to_string().contains("a file that is not a socket is in the way"), "{e}");
     assert_eq!(std::fs::read_to_string(&path).unwrap(), "precious");
 }
@@ -473,7 +496,7 @@ fn ports_that_cannot_be_served_say_why() {
     let rig = RigName::new("r").unwrap();
     let path = runtime.socket_path(&rig);
     let serve = |address: SocketAddr| {
-        api::serve(Arc::<Fake>::default(), &runtime, &rig, Port::At(address)).unwrap_err()
+        api::serve(Arc::<Fake>::default(), &runtime, &rig, tcp(Port::At(address))).unwrap_err()
     };
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let e = serve(taken.local_addr().unwrap());

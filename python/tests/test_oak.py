@@ -552,7 +552,7 @@ def test_without_a_camera_it_says_so(folder: Path) -> None:
 
 
 def test_the_documentation_names_every_option() -> None:
-    text = (ROOT / "docs" / "cameras.md").read_text()
+    text = (ROOT / "docs" / "cameras" / "oak.md").read_text()
     for action in program._parser()._actions:
         for option in action.option_strings:
             assert option in ("-h", "--help") or f"`{option}" in text or f" {option} " in text, option

@@ -5,7 +5,7 @@
 
 use crate::dataset::{segment_number, segments_in};
 use crate::fs::Fs;
-use crate::{Error, ErrorKind, Outcome, Result, SESSION_FILE, Session};
+use crate::{Error, ErrorKind, Mark, Outcome, Result, SESSION_FILE, Session};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
@@ -58,6 +58,8 @@ pub struct CatalogEntry {
     pub scene: String,
     /// Who recorded it.
     pub operator: String,
+    /// A person's judgement.
+    pub mark: Option<Mark>,
     /// The rig's name.
     pub rig: String,
     /// When it began, UTC nanoseconds since 1970; `None` when nothing says so.
@@ -123,6 +125,7 @@ pub fn look_at(fs: &dyn Fs, dir: &Path) -> CatalogEntry {
         name: folder,
         scene: String::new(),
         operator: String::new(),
+        mark: None,
         rig: String::new(),
         started_utc_ns: None,
         duration_ns: 0,
@@ -161,6 +164,7 @@ pub fn look_at(fs: &dyn Fs, dir: &Path) -> CatalogEntry {
     entry.name.clone_from(&session.name);
     entry.scene.clone_from(&session.scene);
     entry.operator.clone_from(&session.operator);
+    entry.mark = session.mark;
     entry.rig.clone_from(&session.rig);
     entry.started_utc_ns = Some(session.started_utc_ns);
     entry.streams = session.streams.len();

@@ -87,8 +87,7 @@ pub(crate) struct EncodedFrame {
 pub(crate) struct FrameEncoder {
     builder: ChunkBuilder,
     options: RecorderOptions,
-    repacked: Vec<u8>,
-    depth: Option<DepthEncoder>,
+    writer: ImageWriter,
 }
 
 impl FrameEncoder {
@@ -97,8 +96,7 @@ impl FrameEncoder {
         Self {
             builder: ChunkBuilder::with_pool(pool),
             options: options.clone(),
-            repacked: Vec::new(),
-            depth: None,
+            writer: ImageWriter::new(options.jpeg_quality),
         }
     }
 
@@ -131,40 +129,18 @@ impl FrameEncoder {
             }
             self.builder.expect(image::room(job.frame_id, pixels));
         }
-        let quality = self.options.jpeg_quality.clamp(1, 100);
-        let repacked = &mut self.repacked;
-        let stamp = job.stamp_utc_ns;
-        let frame_id = job.frame_id;
-        let depth = &mut self.depth;
-        let (message_bytes, message_crc32) =
-            self.builder.message(head, |buf| match (codec, format.ros_encoding()) {
-                (Codec::Raw, Some(encoding)) => {
-                    image::write_image(buf, stamp, frame_id, h, encoding, pixels);
-                    Ok(())
-                }
-                (Codec::Raw, None) => Err(as_they_are(format)),
-                (Codec::Mjpeg, _) => image::write_compressed(buf, stamp, frame_id, "jpeg", |out| {
-                    out.extend_from_slice(pixels);
-                    Ok(())
-                }),
-                (Codec::Jpeg, _) => image::write_compressed(buf, stamp, frame_id, "jpeg", |out| {
-                    if let Some(stored) = stored {
-                        out.extend_from_slice(stored);
-                        return Ok(());
-                    }
-                    jpeg(out, h, format, pixels, quality, repacked)
-                }),
-                (Codec::Png, _) => image::write_compressed(buf, stamp, frame_id, "png", |out| {
-                    png(out, h, format, pixels, packing, repacked)
-                }),
-                (Codec::Rank, _) => {
-                    let shape = DepthShape { width: h.width, height: h.height, step: h.stride };
-                    let encoder = depth.get_or_insert_default();
-                    image::write_compressed_depth(buf, stamp, frame_id, shape, DEPTH_CODEC, |out| {
-                        encoder.encode(pixels, shape, out)
-                    })
-                }
-            })?;
+        let image = ImageJob {
+            header: h,
+            format,
+            pixels,
+            stored,
+            codec,
+            packing,
+            frame_id: job.frame_id,
+            stamp_utc_ns: job.stamp_utc_ns,
+        };
+        let writer = &mut self.writer;
+        let (message_bytes, message_crc32) = self.builder.message(head, |buf| writer.write(buf, &image))?;
         Ok(EncodedFrame { chunk: self.builder.pack(compress)?, codec, message_bytes, message_crc32 })
     }
 
@@ -184,6 +160,74 @@ impl FrameEncoder {
             image::write_image_head(buf, job.stamp_utc_ns, job.frame_id, h, encoding, h.payload_len);
         });
         Ok(EncodedFrame { chunk: self.builder.pack(false)?, codec: Codec::Raw, message_bytes, message_crc32 })
+    }
+}
+
+/// An image, and how its message has it.
+pub(crate) struct ImageJob<'a> {
+    pub(crate) header: &'a FrameHeader,
+    pub(crate) format: PixelFormat,
+    /// As many as the header says.
+    pub(crate) pixels: &'a [u8],
+    /// The JPEG that they were decoded from, if they were.
+    pub(crate) stored: Option<&'a [u8]>,
+    pub(crate) codec: Codec,
+    /// How hard a PNG is packed.
+    pub(crate) packing: CompressionType,
+    pub(crate) frame_id: &'a str,
+    pub(crate) stamp_utc_ns: i64,
+}
+
+/// Writes the messages of images.
+pub(crate) struct ImageWriter {
+    quality: u8,
+    repacked: Vec<u8>,
+    depth: Option<DepthEncoder>,
+}
+
+impl ImageWriter {
+    pub(crate) fn new(jpeg_quality: u8) -> Self {
+        Self { quality: jpeg_quality.clamp(1, 100), repacked: Vec::new(), depth: None }
+    }
+
+    /// Appends the message.
+    ///
+    /// # Errors
+    /// [`ErrorKind::BadInput`] for pixels that are no image, [`ErrorKind::Codec`] when they cannot be encoded.
+    pub(crate) fn write(&mut self, buf: &mut Vec<u8>, image: &ImageJob<'_>) -> Result<()> {
+        let ImageJob { header: h, format, pixels, stored, codec, packing, frame_id, stamp_utc_ns } = *image;
+        let stamp = stamp_utc_ns;
+        let quality = self.quality;
+        let repacked = &mut self.repacked;
+        let depth = &mut self.depth;
+        match (codec, format.ros_encoding()) {
+            (Codec::Raw, Some(encoding)) => {
+                image::write_image(buf, stamp, frame_id, h, encoding, pixels);
+                Ok(())
+            }
+            (Codec::Raw, None) => Err(as_they_are(format)),
+            (Codec::Mjpeg, _) => image::write_compressed(buf, stamp, frame_id, "jpeg", |out| {
+                out.extend_from_slice(pixels);
+                Ok(())
+            }),
+            (Codec::Jpeg, _) => image::write_compressed(buf, stamp, frame_id, "jpeg", |out| {
+                if let Some(stored) = stored {
+                    out.extend_from_slice(stored);
+                    return Ok(());
+                }
+                jpeg(out, h, format, pixels, quality, repacked)
+            }),
+            (Codec::Png, _) => image::write_compressed(buf, stamp, frame_id, "png", |out| {
+                png(out, h, format, pixels, packing, repacked)
+            }),
+            (Codec::Rank, _) => {
+                let shape = DepthShape { width: h.width, height: h.height, step: h.stride };
+                let encoder = depth.get_or_insert_default();
+                image::write_compressed_depth(buf, stamp, frame_id, shape, DEPTH_CODEC, |out| {
+                    encoder.encode(pixels, shape, out)
+                })
+            }
+        }
     }
 }
 

@@ -28,6 +28,7 @@ mod frame;
 pub mod fs;
 #[cfg(any(test, feature = "testing"))]
 pub mod fuzzing;
+mod live;
 mod msgs;
 pub mod npy;
 mod options;
@@ -44,6 +45,7 @@ mod slice;
 pub mod still;
 #[cfg(any(test, feature = "testing"))]
 pub mod testing;
+pub mod trigger;
 mod verify;
 
 pub use cat::{
@@ -64,6 +66,7 @@ pub use error::{Error, ErrorKind, Result};
 pub use frame::{
     IMAGE_MAX_BYTES, Pixels, PushError, RecordFrame, RecordMotion, RecordSet, SET_MOTION_MAX_BYTES, SetDrop,
 };
+pub use live::{LiveChannel, LiveEncoder, LiveFrame, LiveSource, LiveTopics};
 pub use msgs::{Diagnostic, Level, SetCounts, StreamAccount};
 pub use options::{ColorCodec, Compression, DepthCodec, LIVE_LATE_NS, RecorderOptions, live_late_ns};
 pub use outside::check_outside;
@@ -75,8 +78,8 @@ pub use recover::{
 };
 pub use select::{Edge, Moment, SetSpan};
 pub use session::{
-    Computed, Derived, Edit, FORMAT, MotionRecord, NOTE_MAX_BYTES, Note, Outcome, SESSION_FILE, Session,
-    SessionChanges, StreamCalibration, StreamRecord, UnitCalibration, check_name, edit, rename,
+    Computed, Derived, Edit, FORMAT, Mark, MotionRecord, NOTE_MAX_BYTES, Note, Outcome, SESSION_FILE,
+    Session, SessionChanges, StreamCalibration, StreamRecord, UnitCalibration, check_name, edit, rename,
 };
 pub use slice::{SliceOptions, SliceProgress, SliceReport, merge, trim};
 pub use still::{StillFormat, still};

@@ -61,6 +61,9 @@ pub struct Session {
     /// allows. Without it `verify` checks the spread only against a limit in its options.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub max_spread_ns: Option<i64>,
+    /// A person's judgement.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mark: Option<Mark>,
     /// How it ended; absent while it runs and when it was cut off.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub outcome: Option<Outcome>,
@@ -87,6 +90,26 @@ pub struct Session {
     /// Keys that this version does not know: a user's own, or a later version's. They are kept.
     #[serde(flatten)]
     pub extra: toml::Table,
+}
+
+/// A person's judgement of a recording. Nothing is deleted for it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Mark {
+    /// To be used.
+    Good,
+    /// Not to be used.
+    Bad,
+}
+
+impl Mark {
+    /// The name used in files and JSON.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Good => "good",
+            Self::Bad => "bad",
+        }
+    }
 }
 
 /// A change of `session.toml` after the recording.
@@ -117,6 +140,8 @@ impl Edit {
                 calibration_date(&self.before).unwrap_or("none"),
                 calibration_date(&self.after).unwrap_or("none")
             ),
+            "mark" if self.after.is_empty() => format!("mark {} removed", self.before),
+            "mark" => format!("marked {}", self.after),
             field => format!("{field}: {:?} is now {:?}", self.before, self.after),
         }
     }
@@ -322,6 +347,7 @@ impl Session {
             rig_config: String::new(),
             calibration: String::new(),
             max_spread_ns: None,
+            mark: None,
             outcome: None,
             notes: Vec::new(),
             firmware: BTreeMap::new(),

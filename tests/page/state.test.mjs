@@ -58,10 +58,10 @@ test("an image of an earlier watch list belongs to no stream", () => {
 });
 
 const key = (name, more = {}) => ({ key: name, repeat: false, ctrlKey: false, altKey: false, metaKey: false, ...more });
-const nowhere = { isText: false, takesSpace: false, takesEnter: false, takesArrows: false, isInDialog: false };
+const nowhere = { isText: false, takesSpace: false, takesEnter: false, takesArrows: false, takesLetters: false, isInDialog: false };
 
 test("keys do nothing in text fields and dialogs, nor with modifiers", () => {
-  for (const name of [" ", "n", "1", "?", "Escape", "ArrowLeft", "p"]) {
+  for (const name of [" ", "n", "1", "?", "Escape", "ArrowLeft", "p", "r", "b", "G", "m", "l", "y", "d", "c", "k"]) {
     assert.notEqual(actionOf(key(name), nowhere), null, name);
     assert.equal(actionOf(key(name), { ...nowhere, isText: true }), null, name);
     assert.equal(actionOf(key(name), { ...nowhere, isInDialog: true }), null, name);
@@ -81,22 +81,23 @@ test("a key that is held starts and stops once; arrows may repeat", () => {
 const recording = (more) => ({ active: true, path: "/d", dropped: {}, bytes: 0, duration_s: 0, ...more });
 const status = (seconds, taken, dropped = {}) => ({ utc_ns: seconds * 1e9, cameras: [{ streams: [{ dropped }] }], recording: taken });
 
-test("a recording whose time stands still is being closed by somebody else", () => {
+test("a recording that is being closed says so, for whoever asked", () => {
   const watch = new RecordingWatch();
   assert.equal(watch.follow(status(0, null), false).state, "idle");
-  assert.equal(watch.follow(status(1, recording({ duration_s: 0.1 })), false).state, "recording");
+  assert.equal(watch.follow(status(1, recording({ duration_s: 0.6 })), false).state, "recording");
+  // A set that is slow to come is no sign of closing.
   assert.equal(watch.follow(status(1.5, recording({ duration_s: 0.6 })), false).state, "recording");
   assert.equal(watch.follow(status(1.6, recording({ duration_s: 0.7 })), true).state, "closing");
-  assert.equal(watch.follow(status(2, recording({ duration_s: 0.7 })), false).state, "closing");
+  assert.equal(watch.follow(status(2, recording({ duration_s: 0.7, closing: true })), false).state, "closing");
   assert.equal(watch.follow(status(2.5, recording({ duration_s: 0.7, active: false })), false).state, "idle");
 });
 
 test("losses count from the start of the recording, and are new once", () => {
   const watch = new RecordingWatch();
   assert.equal(watch.follow(status(0, recording({ duration_s: 0 }), { no_slot: 7 }), false).hasNewLosses, false);
-  const facts = watch.follow(status(1, recording({ duration_s: 1 }), { no_slot: 9 }), false);
-  assert.deepEqual(facts.frames, { no_slot: 2 });
-  assert.equal(facts.hasNewLosses, true);
+  const later = watch.follow(status(1, recording({ duration_s: 1 }), { no_slot: 9 }), false);
+  assert.deepEqual(later.frames, { no_slot: 2 });
+  assert.equal(later.hasNewLosses, true);
   assert.equal(watch.follow(status(2, recording({ duration_s: 2 }), { no_slot: 9 }), false).hasNewLosses, false);
 });
 

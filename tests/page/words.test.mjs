@@ -53,6 +53,7 @@ test("a recording is described by what there is", () => {
   assert.deepEqual(recordTexts(recording, facts), {
     progress: "01:05 · 9 sets · 2.0 GB · 42.0 MB/s · x",
     losses: "2 sets lost (the disk is too slow)",
+    advice: "The disk takes less than the rig writes: record to a faster disk, or record fewer or smaller streams.",
     hasLosses: true,
     disk: "Disk: 1 min left, 4.0 GB free",
     warning: "little room left",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
 import shutil
 import socket
@@ -14,10 +15,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 from PIL import Image
-from playwright.sync_api import Browser, Locator, Page
+from playwright.sync_api import Browser, BrowserContext, Error, Locator, Page, Route
 from test_daemon import WAIT_S, environment
 
 CHROMIUM = shutil.which("chromium")
@@ -261,10 +263,35 @@ PLACE = """([stream, x, y]) => {
 }"""
 
 
+PAGE_FILES = re.compile(r"^http://[^/]+/[\w.-]*(\?[^/]*)?$")
+PAGE_TYPES = {".html": "text/html; charset=utf-8", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
+
+
+def serve_from(context: BrowserContext, folder: Path) -> None:
+    """Takes the page's files from a folder, with the daemon's headers: they can be tried without building it."""
+
+    def answer(route: Route) -> None:
+        parts = urlsplit(route.request.url)
+        file = folder / (parts.path.strip("/") or "index.html")
+        try:
+            served = route.fetch(url=f"{parts.scheme}://{parts.netloc}/")
+        except Error:
+            route.abort()
+            return
+        headers = {name: value for name, value in served.headers.items() if name not in ("content-length", "etag")}
+        route.fulfill(body=file.read_bytes(), headers={**headers, "content-type": PAGE_TYPES[file.suffix]})
+
+    # A page that did not come from this computer may not speak to it.
+    context.grant_permissions(["local-network-access"])
+    context.route(PAGE_FILES, answer)
+
+
 @contextmanager
 def blank(browser: Browser, origin: str) -> Iterator[Wall]:
     """A tab of its own, with nothing in it yet; at the end nothing may have gone wrong in it."""
     context = browser.new_context(viewport={"width": 1280, "height": 800})
+    if "DEPTHRIG_PAGE_DIR" in os.environ:
+        serve_from(context, Path(os.environ["DEPTHRIG_PAGE_DIR"]))
     try:
         wall = Wall(context.new_page(), origin)
         wall.page.set_default_timeout(WAIT_MS)

@@ -8,6 +8,7 @@ use depthrig_calib::stereo::Preset;
 use depthrig_convert::zed_replay::{ZedReplayOptions, zed_replay};
 use depthrig_daemon::ErrorKind;
 use depthrig_daemon::client::Client;
+use depthrig_daemon::config::Port;
 use depthrig_daemon::control::{Control, RecordRequest, ReplayControl, SeekRequest};
 use depthrig_daemon::replay::{Replay, ReplayOptions};
 use depthrig_daemon::status::CameraState;
@@ -38,6 +39,7 @@ const FAST: ReplayOptions = ReplayOptions {
     paused: true,
     hold: false,
     refine: None,
+    foxglove: Port::Off,
     serve_api: false,
 };
 

@@ -65,6 +65,7 @@ pub enum Command {
     #[command(after_help = open::EXAMPLES)]
     Open(open::OpenArgs),
     /// Watch the running daemon, refreshed in place; q or Ctrl-C quits
+    #[command(after_help = top::EXAMPLES)]
     Top(top::TopArgs),
     /// Replay datasets on the live channels, and control a running replay
     #[command(after_help = replay::EXAMPLES)]

@@ -32,6 +32,8 @@ pub struct SystemFile {
     pub what: &'static str,
     /// All of it, the first line included.
     pub text: String,
+    /// Where the Debian package puts it, without the first line; the file at `path` takes its place.
+    pub packaged: Option<PathBuf>,
 }
 
 /// How a file stands.
@@ -39,6 +41,10 @@ pub struct SystemFile {
 pub enum State {
     /// Not there.
     Missing,
+    /// Not there, and not needed: the package brings it with the same contents.
+    Packaged,
+    /// Not there; the package brings it with other contents.
+    PackagedOther,
     /// There, as this version writes it.
     Current,
     /// There, as depthrig wrote it once.
@@ -56,6 +62,8 @@ pub enum Done {
     Unchanged,
     /// Changed by hand, so it was kept.
     Refused,
+    /// The package brings it, so nothing was written or removed.
+    Packaged,
     /// It is gone.
     Removed,
     /// There was none.
@@ -69,19 +77,27 @@ pub fn files(service: &Service) -> Vec<SystemFile> {
         .replace("@BINARY@", &quoted(&service.binary).replace('$', "$$"))
         .replace("@RIG_FILE@", &quoted(&service.rig_file).replace('$', "$$"))
         .replace("@DATA@", &quoted(&service.data));
-    let file = |path: &str, what, text: &str| SystemFile { path: path.into(), what, text: marked(text) };
+    let file = |path: &str, what, text: &str, packaged: Option<&str>| SystemFile {
+        path: path.into(),
+        what,
+        text: marked(text),
+        packaged: packaged.map(PathBuf::from),
+    };
     vec![
         file(
             "/etc/udev/rules.d/70-depthrig.rules",
             "who may use cameras; no autosuspend",
             include_str!("../udev/70-depthrig.rules"),
+            Some("/usr/lib/udev/rules.d/70-depthrig.rules"),
         ),
         file(
             "/etc/tmpfiles.d/depthrig.conf",
             "memory for USB transfers",
             include_str!("../tmpfiles/depthrig.conf"),
+            Some("/usr/lib/tmpfiles.d/depthrig.conf"),
         ),
-        file("/etc/systemd/system/depthrig.service", "the daemon as a service", &unit),
+        // The package's service is one of a user's own systemd, which is another file.
+        file("/etc/systemd/system/depthrig.service", "the daemon as a service", &unit, None),
     ]
 }
 
@@ -114,7 +130,12 @@ fn is_ours(text: &str) -> bool {
 impl SystemFile {
     /// Where it lies when the system is in the folder `root`.
     pub fn below(&self, root: &Path) -> PathBuf {
-        root.join(self.path.strip_prefix("/").unwrap_or(&self.path))
+        below(root, &self.path)
+    }
+
+    /// The package's file, when it is there, in the folder `root`.
+    pub fn packaged_below(&self, root: &Path) -> Option<PathBuf> {
+        self.packaged.as_deref().map(|path| below(root, path)).filter(|path| path.is_file())
     }
 
     /// How it stands below `root`.
@@ -127,9 +148,17 @@ impl SystemFile {
             Ok(bytes) if bytes == self.text.as_bytes() => Ok(State::Current),
             Ok(bytes) if std::str::from_utf8(&bytes).is_ok_and(is_ours) => Ok(State::Older),
             Ok(_) => Ok(State::Changed),
-            Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(State::Missing),
+            Err(e) if e.kind() == io::ErrorKind::NotFound => self.state_of_packaged(root),
             Err(e) => Err(e).with_context(|| format!("{} cannot be read", path.display())),
         }
+    }
+
+    fn state_of_packaged(&self, root: &Path) -> Result<State> {
+        let Some(path) = self.packaged_below(root) else { return Ok(State::Missing) };
+        let bytes = depthrig_bus::files::read(&path, depthrig_bus::files::TEXT_MAX_BYTES)
+            .with_context(|| format!("{} cannot be read", path.display()))?;
+        let same = std::str::from_utf8(&bytes).is_ok_and(|text| marked(text) == self.text);
+        Ok(if same { State::Packaged } else { State::PackagedOther })
     }
 
     /// Installs the file; replaces one changed by hand only with `overwrite`.
@@ -140,6 +169,7 @@ impl SystemFile {
         let state = self.state(root)?;
         match state {
             State::Current => return Ok(Done::Unchanged),
+            State::Packaged => return Ok(Done::Packaged),
             State::Changed if !overwrite => return Ok(Done::Refused),
             _ => {}
         }
@@ -153,7 +183,8 @@ impl SystemFile {
             let mode = std::os::unix::fs::PermissionsExt::from_mode(0o644);
             file.file().set_permissions(mode)?;
             // A file created since the check is not ours.
-            if state == State::Missing { file.create() } else { file.replace() }
+            let absent = matches!(state, State::Missing | State::PackagedOther);
+            if absent { file.create() } else { file.replace() }
         };
         write().map_err(|e| refused(e, &path))?;
         Ok(Done::Written)
@@ -166,6 +197,7 @@ impl SystemFile {
     pub fn remove(&self, root: &Path, overwrite: bool) -> Result<Done> {
         match self.state(root)? {
             State::Missing => return Ok(Done::Absent),
+            State::Packaged | State::PackagedOther => return Ok(Done::Packaged),
             State::Changed if !overwrite => return Ok(Done::Refused),
             _ => {}
         }
@@ -173,6 +205,10 @@ impl SystemFile {
         std::fs::remove_file(&path).map_err(|e| refused(e, &path))?;
         Ok(Done::Removed)
     }
+}
+
+fn below(root: &Path, path: &Path) -> PathBuf {
+    root.join(path.strip_prefix("/").unwrap_or(path))
 }
 
 fn refused(e: io::Error, path: &Path) -> anyhow::Error {

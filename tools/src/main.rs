@@ -26,6 +26,7 @@ mod screen;
 mod signals;
 mod turbo;
 mod view;
+mod wall;
 mod watched;
 
 fn main() {

@@ -1,23 +1,42 @@
 //! The terminal as `top` and `calibrate capture` use it: a page that is redrawn in place, and keys without Enter.
 
+mod keys;
+
+use crate::printable;
+use crate::view::clip;
 use anyhow::{Context, Result};
+use core::cell::Cell;
 use core::time::Duration;
+use depthrig_bus::HostTime;
+use keys::Keys;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::termios::{self, LocalModes, OptionalActions, Termios};
-use std::io::{IsTerminal, Read, Stdout, Write};
+use std::io::{IsTerminal, Stdout, Write};
+use std::sync::{Mutex, PoisonError};
 
 /// Columns and rows of a terminal that does not say.
 pub const USUAL: (usize, usize) = (80, 24);
 const ENTER: &str = "\x1b[?1049h\x1b[?25l";
-const LEAVE: &str = "\x1b[?25h\x1b[?1049l";
+const LEAVE: &str = "\x1b[0m\x1b[?25h\x1b[?1049l";
 const HOME: &str = "\x1b[H";
+const CLEAR: &str = "\x1b[2J";
 const CLEAR_LINE: &str = "\x1b[K";
 const CLEAR_BELOW: &str = "\x1b[J";
+
+/// What a terminal that is taken has to be given back: the settings of its keyboard, and the messages of panics, which
+/// would be lost with the page.
+static TAKEN: Mutex<Option<Taken>> = Mutex::new(None);
+
+struct Taken {
+    keyboard: Option<Termios>,
+    panics: Vec<String>,
+}
 
 /// The page. Dropping it gives the terminal back as it was.
 pub struct Screen {
     out: Stdout,
-    before: Option<Termios>,
+    has_keys: bool,
+    keys: Cell<Keys>,
 }
 
 impl Screen {
@@ -35,15 +54,18 @@ impl Screen {
             .into());
         }
         // Keys come at once and unseen; Ctrl-C still is a signal. Without a keyboard there are no keys.
-        let before = termios::tcgetattr(std::io::stdin()).ok();
-        if let Some(before) = &before {
+        let keyboard = termios::tcgetattr(std::io::stdin()).ok();
+        let has_keys = keyboard.is_some();
+        if let Some(before) = &keyboard {
             let mut raw = before.clone();
             raw.local_modes.remove(LocalModes::ICANON | LocalModes::ECHO);
             termios::tcsetattr(std::io::stdin(), OptionalActions::Now, &raw)
                 .context("the terminal cannot be set up")?;
         }
-        let screen = Self { out, before };
-        screen.write(ENTER)?;
+        *TAKEN.lock().unwrap_or_else(PoisonError::into_inner) = Some(Taken { keyboard, panics: Vec::new() });
+        let screen = Self { out, has_keys, keys: Cell::default() };
+        keep_panics();
+        screen.put(ENTER)?;
         Ok(screen)
     }
 
@@ -53,50 +75,135 @@ impl Screen {
     /// When the terminal is gone.
     pub fn draw(&self, text: &str) -> Result<()> {
         let (width, height) = size().unwrap_or(USUAL);
-        let mut page = HOME.to_owned();
-        let text = crate::printable::styled(text);
-        for (i, line) in text.lines().take(height).enumerate() {
-            page.push_str(if i == 0 { "" } else { "\r\n" });
-            page.push_str(&crate::view::clip(line, width));
-            page.push_str(CLEAR_LINE);
-        }
-        page.push_str(CLEAR_BELOW);
-        self.write(&page)
+        self.put(&format!("{}{CLEAR_BELOW}", page(text, width, height)))
     }
 
-    fn write(&self, text: &str) -> Result<()> {
+    /// Draws the first `rows` lines of `text` and leaves what is below as it is.
+    ///
+    /// # Errors
+    /// When the terminal is gone.
+    pub fn draw_top(&self, text: &str, rows: usize) -> Result<()> {
+        let (width, _) = size().unwrap_or(USUAL);
+        self.put(&page(text, width, rows))
+    }
+
+    /// Clears the page.
+    ///
+    /// # Errors
+    /// When the terminal is gone.
+    pub fn clear(&self) -> Result<()> {
+        self.put(CLEAR)
+    }
+
+    /// Writes bytes of depthrig's own, such as an image, as they are.
+    ///
+    /// # Errors
+    /// When the terminal is gone.
+    pub fn put(&self, text: &str) -> Result<()> {
         let mut out = self.out.lock();
         out.write_all(text.as_bytes())?;
         out.flush()?;
         Ok(())
     }
 
-    /// Waits up to `length` for a key.
+    /// Sends a question to the terminal and returns the bytes of its answer, until `is_complete` or for `length`.
+    ///
+    /// # Errors
+    /// When the terminal is gone.
+    pub fn ask(
+        &self,
+        question: &str,
+        length: Duration,
+        is_complete: impl Fn(&[u8]) -> bool,
+    ) -> Result<Vec<u8>> {
+        let mut answer = Vec::new();
+        if !self.has_keys {
+            return Ok(answer);
+        }
+        self.put(question)?;
+        let until = HostTime::now().plus(length);
+        while !until.from_now().is_zero() && !is_complete(&answer) {
+            answer.extend(self.byte(until.from_now()));
+        }
+        Ok(answer)
+    }
+
+    /// Waits up to `length` for a key. Keys that send several bytes, such as arrows, and late answers of the terminal are skipped.
     pub fn key(&self, length: Duration) -> Option<u8> {
+        let until = HostTime::now().plus(length);
+        loop {
+            let byte = self.byte(until.from_now())?;
+            let mut keys = self.keys.take();
+            let key = keys.next(byte);
+            self.keys.set(keys);
+            if key.is_some() {
+                return key;
+            }
+        }
+    }
+
+    /// Waits up to `length` for a byte from the terminal.
+    fn byte(&self, length: Duration) -> Option<u8> {
         let stdin = std::io::stdin();
         let timeout = Timespec { tv_sec: length.as_secs() as i64, tv_nsec: i64::from(length.subsec_nanos()) };
         let mut fds = [PollFd::new(&stdin, PollFlags::IN)];
         // A signal interrupts the wait; the caller looks for it.
-        let ready = self.before.is_some() && poll(&mut fds, Some(&timeout)).is_ok_and(|n| n > 0);
+        let ready = self.has_keys && poll(&mut fds, Some(&timeout)).is_ok_and(|n| n > 0);
         if !ready {
-            if self.before.is_none() {
+            if !self.has_keys {
                 std::thread::sleep(length);
             }
             return None;
         }
-        let mut key = [0];
-        (stdin.lock().read(&mut key).ok()? == 1).then_some(key[0])
+        // Not through the standard library's buffer, in which `poll` sees nothing.
+        let mut byte = [0];
+        (rustix::io::read(&stdin, &mut byte).ok()? == 1).then_some(byte[0])
     }
 }
 
 impl Drop for Screen {
     fn drop(&mut self) {
-        // A terminal that is gone needs no restoring.
-        let _ = self.write(LEAVE);
-        if let Some(before) = &self.before {
-            let _ = termios::tcsetattr(std::io::stdin(), OptionalActions::Now, before);
-        }
+        restore();
     }
+}
+
+/// Gives a terminal back that a [`Screen`] has taken, also where it cannot be dropped: before the process is ended.
+pub fn restore() {
+    let Some(taken) = TAKEN.lock().unwrap_or_else(PoisonError::into_inner).take() else { return };
+    // A terminal that is gone needs no restoring.
+    if let Some(keyboard) = &taken.keyboard {
+        let _ = termios::tcsetattr(std::io::stdin(), OptionalActions::Now, keyboard);
+    }
+    // Not for one that takes no bytes: it would keep the process from ending.
+    let stdout = std::io::stdout();
+    let mut fds = [PollFd::new(&stdout, PollFlags::OUT)];
+    let now = Timespec { tv_sec: 0, tv_nsec: 0 };
+    if poll(&mut fds, Some(&now)).is_ok_and(|n| n > 0) {
+        let _ = rustix::io::write(&stdout, LEAVE.as_bytes());
+    }
+    for message in taken.panics {
+        crate::out::note(message);
+    }
+}
+
+/// Keeps the messages of panics until the terminal is given back; printed on the page they would vanish with it.
+fn keep_panics() {
+    let before = std::panic::take_hook();
+    std::panic::set_hook(Box::new(move |panic| match TAKEN.try_lock().ok().as_deref_mut() {
+        Some(Some(taken)) => taken.panics.push(panic.to_string()),
+        _ => before(panic),
+    }));
+}
+
+/// The first lines of a text, drawn from the top of the terminal.
+fn page(text: &str, width: usize, height: usize) -> String {
+    let mut page = HOME.to_owned();
+    for (i, line) in printable::styled(text).lines().take(height).enumerate() {
+        page.push_str(if i == 0 { "" } else { "\r\n" });
+        page.push_str(&clip(line, width));
+        page.push_str(CLEAR_LINE);
+    }
+    page
 }
 
 /// Columns and rows of the terminal behind the standard output, if it is one.
@@ -104,3 +211,14 @@ pub fn size() -> Option<(usize, usize)> {
     let size = termios::tcgetwinsize(std::io::stdout()).ok()?;
     (size.ws_col > 0 && size.ws_row > 0).then(|| (size.ws_col.into(), size.ws_row.into()))
 }
+
+/// Width and height of a character in pixels, if the terminal says.
+pub fn cell() -> Option<(usize, usize)> {
+    let size = termios::tcgetwinsize(std::io::stdout()).ok()?;
+    let width = size.ws_xpixel.checked_div(size.ws_col)?;
+    let height = size.ws_ypixel.checked_div(size.ws_row)?;
+    (width > 0 && height > 0).then(|| (width.into(), height.into()))
+}
+
+#[cfg(test)]
+mod tests;

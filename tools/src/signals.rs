@@ -55,6 +55,7 @@ impl Stop {
                     _ = terminate.recv() => {}
                 }
                 if asked.swap(true, Ordering::Relaxed) {
+                    crate::screen::restore();
                     std::process::exit(AT_ONCE);
                 }
                 drop(wakes_waiters.take());

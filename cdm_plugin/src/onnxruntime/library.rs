@@ -5,6 +5,8 @@
 // Loading a library and asking for its version are calls into foreign code.
 #![allow(unsafe_code)]
 
+mod python;
+
 use super::device::Device;
 use crate::{Error, ErrorKind, Result};
 use core::ffi::{CStr, c_char, c_void};
@@ -55,8 +57,8 @@ fn missing(what: &str, device: &Device) -> Error {
     let package = device.package();
     let message = format!(
         "ONNX Runtime was not found: {what}, and no libonnxruntime.so is there. In a checkout run \
-         `tools/onnxruntime.sh {variant}`; elsewhere `pip install {package}` and set {VARIABLE} or the setting \
-         `library` to the folder onnxruntime/capi of that package",
+         `tools/onnxruntime.sh {variant}`; elsewhere `pip install {package}`, in the Python environment of depthrig or \
+         in another one whose folder onnxruntime/capi {VARIABLE} or the setting `library` names",
         variant = device.variants()[0],
     );
     Error::new(ErrorKind::NoEngine, message)
@@ -65,10 +67,12 @@ fn missing(what: &str, device: &Device) -> Error {
 /// Every folder to look into, best first.
 fn places(device: &Device) -> Vec<PathBuf> {
     let mut roots: Vec<PathBuf> = Vec::new();
+    let mut installed: Vec<PathBuf> = Vec::new();
     // `target/onnxruntime` for the programs and tests of a checkout; `/usr/local/bin/onnxruntime` of an installed one
     // does no harm.
     if let Ok(program) = std::env::current_exe() {
         roots.extend(program.ancestors().skip(1).take(3).map(|a| a.join(FOLDER)));
+        installed = python::folders(&program);
     }
     let home = || std::env::var_os("HOME").map(|h| PathBuf::from(h).join(".local/share"));
     let data = std::env::var_os("XDG_DATA_HOME").filter(|v| !v.is_empty()).map(PathBuf::from).or_else(home);
@@ -76,6 +80,7 @@ fn places(device: &Device) -> Vec<PathBuf> {
     roots.push("/var/lib/depthrig/onnxruntime".into());
     let mut folders: Vec<PathBuf> =
         device.variants().iter().flat_map(|v| roots.iter().map(move |r| r.join(v))).collect();
+    folders.extend(installed);
     folders.extend(roots);
     folders.extend(SYSTEM.map(PathBuf::from));
     folders

@@ -7,9 +7,10 @@ use super::{COLOR, PREFIXES, StereoOptions};
 use core::time::Duration;
 use depthrig_bus::{DropReason, FrameFlags, HostTime};
 use depthrig_driver::clock::{CalibratedLatency, ClockQuality};
+use depthrig_driver::controls::ControlPanel;
 use depthrig_driver::moments::{Due, FrameSchedule, SetTimes};
 use depthrig_driver::{Error, ErrorKind, FrameMeta, FrameSink, Poll, Result, Stream, StreamProfile};
-use std::sync::Arc;
+use std::sync::{Arc, Weak};
 
 /// How often the threads' results are looked for while the camera is waited for.
 const SLICE: Duration = Duration::from_millis(2);
@@ -110,6 +111,10 @@ impl StereoStream {
 impl Stream for StereoStream {
     fn profiles(&self) -> &[StreamProfile] {
         &self.profiles
+    }
+
+    fn controls(&self) -> Option<Weak<dyn ControlPanel>> {
+        self.inner.controls()
     }
 
     fn poll(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> Result<Poll> {

@@ -1,16 +1,18 @@
 //! The WebSocket of the live page: status, images, and questions about pixels. docs/live-page.md describes its messages.
 
 use super::limits::end_of;
+use super::recordings;
 use super::reply::Refusal;
+use super::requests::{LoopRequest, RateRequest, StepRequest};
 use super::token::Token;
-use crate::control::Control;
-use crate::status::RigStatus;
+use crate::control::{Control, ReplayControl, SeekRequest, Shown};
+use crate::status::{ReplayStatus, RigStatus};
 use crate::viewers::{
     Geometry, Measured, Message, OfStream, PROTOCOL, PixelAnswer, PixelQuestion, Place, Viewers, Watch,
 };
 use axum::Extension;
-use axum::extract::State;
 use axum::extract::ws::{CloseFrame, Message as Frame, WebSocket, WebSocketUpgrade};
+use axum::extract::{Query, State};
 use axum::http::StatusCode;
 use axum::response::{IntoResponse, Response};
 use core::time::Duration;
@@ -35,6 +37,7 @@ mod code {
     pub(super) const BAD_MESSAGE: u16 = 4400;
     pub(super) const DENIED: u16 = 4401;
     pub(super) const NO_TOKEN: u16 = 4408;
+    pub(super) const NOT_SHOWN: u16 = 4404;
     pub(super) const FULL: u16 = 4429;
 }
 
@@ -59,6 +62,39 @@ enum Request {
     Watch(Vec<Watch>),
     Credit(u32),
     Pixel(PixelQuestion),
+    Replay(Steer),
+}
+
+/// A command to the replay; the fields are those of the calls below `/v1/replay`.
+#[derive(Debug, Deserialize)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
+enum Steer {
+    Pause {},
+    Resume {},
+    Seek(SeekRequest),
+    Step(StepRequest),
+    Rate(RateRequest),
+    Loop(LoopRequest),
+}
+
+impl Steer {
+    fn apply(&self, replay: &dyn ReplayControl) -> crate::Result<ReplayStatus> {
+        match self {
+            Self::Pause {} => replay.pause(),
+            Self::Resume {} => replay.resume(),
+            Self::Seek(to) => replay.seek(to),
+            Self::Step(step) => replay.step(step.sets),
+            Self::Rate(request) => replay.set_rate(request.rate),
+            Self::Loop(request) => replay.set_loop(request.on),
+        }
+    }
+}
+
+/// Options in a page's address.
+#[derive(Debug, Default, Deserialize)]
+pub(super) struct Asked {
+    /// A recording to show in place of the cameras, as the list of recordings names it.
+    dataset: Option<String>,
 }
 
 /// A text message to the client.
@@ -79,6 +115,9 @@ struct Hello<'a> {
     version: &'static str,
     rig: &'a str,
     is_replay: bool,
+    /// The recording that is shown in place of the cameras.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    dataset: Option<&'a str>,
 }
 
 /// Why a connection ends.
@@ -98,6 +137,7 @@ pub(super) async fn upgrade(
     upgrade: Result<WebSocketUpgrade, axum::extract::ws::rejection::WebSocketUpgradeRejection>,
     State(rig): State<Arc<dyn Control>>,
     Extension(live): Extension<Live>,
+    Query(asked): Query<Asked>,
 ) -> Response {
     let Ok(held) = Arc::clone(&live.places).try_acquire_owned() else {
         return Refusal::new(StatusCode::SERVICE_UNAVAILABLE, "too many pages are open; close one")
@@ -105,7 +145,7 @@ pub(super) async fn upgrade(
     };
     match upgrade {
         Ok(upgrade) => upgrade.max_message_size(MAX_MESSAGE_BYTES).on_upgrade(async move |socket| {
-            serve(socket, rig, live).await;
+            serve(socket, rig, live, asked).await;
             drop(held);
         }),
         Err(_) => Refusal::new(StatusCode::BAD_REQUEST, "this is a WebSocket; the live page (/) opens it")
@@ -113,9 +153,9 @@ pub(super) async fn upgrade(
     }
 }
 
-async fn serve(mut socket: WebSocket, rig: Arc<dyn Control>, live: Live) {
-    let end = match begin(&mut socket, &*rig, &live).await {
-        Ok(client) => client.serve(&mut socket, rig, live.stopped).await,
+async fn serve(mut socket: WebSocket, rig: Arc<dyn Control>, live: Live, asked: Asked) {
+    let end = match begin(&mut socket, rig, &live, asked).await {
+        Ok(client) => client.serve(&mut socket, live.stopped).await,
         Err(end) => Some(end),
     };
     if let Some(End { code, reason }) = end {
@@ -127,7 +167,12 @@ async fn serve(mut socket: WebSocket, rig: Arc<dyn Control>, live: Live) {
 }
 
 /// Checks the token and finds a place.
-async fn begin(socket: &mut WebSocket, rig: &dyn Control, live: &Live) -> Result<Client, End> {
+async fn begin(
+    socket: &mut WebSocket,
+    rig: Arc<dyn Control>,
+    live: &Live,
+    asked: Asked,
+) -> Result<Client, End> {
     if let Some(token) = &live.token {
         let first = tokio::time::timeout(TOKEN_TIMEOUT, socket.recv()).await;
         match first {
@@ -139,33 +184,65 @@ async fn begin(socket: &mut WebSocket, rig: &dyn Control, live: &Live) -> Result
             Ok(_) => return Err(End::new(code::DENIED, "the token is missing")),
         }
     }
-    let Some((place, messages)) = live.viewers.enter() else {
+    let mut view = View { rig, viewers: live.viewers.clone(), shown: None };
+    if let Some(name) = asked.dataset.clone() {
+        let rig = Arc::clone(&view.rig);
+        let shown = tokio::task::spawn_blocking(move || show(&*rig, &name)).await;
+        view = shown
+            .map_err(|e| End::new(code::NOT_SHOWN, e.to_string()))?
+            .map_err(|e| End::new(code::NOT_SHOWN, e.to_string()))?;
+    }
+    let Some((place, messages)) = view.viewers.enter() else {
         return Err(End::new(code::FULL, format!("{} pages are open already", crate::viewers::MAX_VIEWERS)));
     };
     let hello = Hello {
         protocol: PROTOCOL,
         version: env!("CARGO_PKG_VERSION"),
         rig: live.viewers.rig().as_str(),
-        is_replay: rig.replay().is_some(),
+        is_replay: view.rig.replay().is_some(),
+        dataset: asked.dataset.as_deref(),
     };
     send(socket, &Answer::Hello(hello)).await.map_err(|_| End::new(code::STOPPED, ""))?;
-    Ok(Client { place, messages })
+    Ok(Client { place, messages, view })
+}
+
+/// The source of a page's images: the rig, or one of its recordings.
+struct View {
+    rig: Arc<dyn Control>,
+    viewers: Viewers,
+    shown: Option<Arc<Shown>>,
+}
+
+fn show(rig: &dyn Control, name: &str) -> crate::Result<View> {
+    let nothing = || {
+        let what = "this rig shows no recordings; replay one with: depthrig replay DATASET";
+        crate::Error::new(crate::ErrorKind::WrongState, what)
+    };
+    let shows = rig.shows().ok_or_else(nothing)?;
+    let shown = shows.show(&recordings::folder(rig, name)?)?;
+    let viewers = Viewers::new(shown.runtime.clone(), shown.rig.clone());
+    Ok(View { rig: Arc::clone(&shown.control), viewers, shown: Some(shown) })
+}
+
+impl Drop for View {
+    fn drop(&mut self) {
+        if let Some(shown) = self.shown.take() {
+            // The end of a replay waits for its threads.
+            drop(tokio::task::spawn_blocking(move || drop(shown)));
+        }
+    }
 }
 
 /// A client that may look.
 struct Client {
     place: Place,
     messages: mpsc::Receiver<Message>,
+    view: View,
 }
 
 impl Client {
     /// Serves until one side ends; `None` when the client has gone.
-    async fn serve(
-        mut self,
-        socket: &mut WebSocket,
-        rig: Arc<dyn Control>,
-        mut stopped: watch::Receiver<bool>,
-    ) -> Option<End> {
+    async fn serve(mut self, socket: &mut WebSocket, mut stopped: watch::Receiver<bool>) -> Option<End> {
         let mut status = interval(STATUS_PERIOD);
         status.set_missed_tick_behavior(MissedTickBehavior::Skip);
         let mut ping = interval(PING_PERIOD);
@@ -176,9 +253,13 @@ impl Client {
                 received = socket.recv() => {
                     heard = Instant::now();
                     match received {
-                        Some(Ok(Frame::Text(text))) => match self.take(&text) {
-                            Ok(None) => Ok(()),
-                            Ok(Some(message)) => send(socket, &Answer::Problem { message }).await,
+                        Some(Ok(Frame::Text(text))) => match self.take(&text).await {
+                            Ok(Done::Quietly) => Ok(()),
+                            Ok(Done::Steered) => {
+                                status.reset_immediately();
+                                Ok(())
+                            }
+                            Ok(Done::Problem(message)) => send(socket, &Answer::Problem { message }).await,
                             Err(end) => return Some(end),
                         },
                         Some(Ok(Frame::Binary(_))) => return Some(End::new(code::BAD_MESSAGE, "a binary message")),
@@ -195,7 +276,7 @@ impl Client {
                     None => return None,
                 },
                 _ = status.tick() => {
-                    let rig = Arc::clone(&rig);
+                    let rig = Arc::clone(&self.view.rig);
                     match tokio::task::spawn_blocking(move || rig.status()).await {
                         Ok(status) => send(socket, &Answer::Status(&status)).await,
                         Err(_) => return None,
@@ -214,23 +295,45 @@ impl Client {
         }
     }
 
-    /// Does what the client asks for; a message about something that could not be done.
-    fn take(&self, text: &str) -> Result<Option<String>, End> {
-        match serde_json::from_str(text) {
+    /// Does what the client asks for.
+    async fn take(&self, text: &str) -> Result<Done, End> {
+        let request = serde_json::from_str(text).map_err(|e| End::new(code::BAD_MESSAGE, e.to_string()))?;
+        let problem = |e: crate::Error| Done::Problem(e.to_string());
+        Ok(match request {
             // On the socket none is needed, and one more does no harm.
-            Ok(Request::Token(_)) => Ok(None),
-            Ok(Request::Watch(wanted)) => Ok(self.place.watch(&wanted).err().map(|e| e.to_string())),
-            Ok(Request::Credit(images)) => {
+            Request::Token(_) => Done::Quietly,
+            Request::Watch(wanted) => self.place.watch(&wanted).map_or_else(problem, |()| Done::Quietly),
+            Request::Credit(images) => {
                 self.place.credit(images);
-                Ok(None)
+                Done::Quietly
             }
-            Ok(Request::Pixel(question)) => {
+            Request::Pixel(question) => {
                 self.place.ask(question);
-                Ok(None)
+                Done::Quietly
             }
-            Err(e) => Err(End::new(code::BAD_MESSAGE, e.to_string())),
-        }
+            Request::Replay(steer) => {
+                let rig = Arc::clone(&self.view.rig);
+                let steered =
+                    tokio::task::spawn_blocking(move || rig.replay().map(|replay| steer.apply(replay))).await;
+                match steered {
+                    Ok(Some(Ok(_))) => Done::Steered,
+                    Ok(Some(Err(e))) => problem(e),
+                    Ok(None) => Done::Problem("this page shows cameras and no recording".to_owned()),
+                    Err(_) => {
+                        Done::Problem("the call failed inside the daemon; its log says more".to_owned())
+                    }
+                }
+            }
+        })
     }
+}
+
+/// Effect of a client's message.
+enum Done {
+    Quietly,
+    /// The status has changed.
+    Steered,
+    Problem(String),
 }
 
 async fn send(socket: &mut WebSocket, answer: &Answer<'_>) -> Result<(), axum::Error> {

@@ -24,16 +24,23 @@ macro_rules! files {
 }
 
 /// The files in the folder `page`.
-pub(super) static FILES: [File; 51] = files![
-    "aids.js" "aidsdepth.js" "aidsimage.js" "aidsoverlay.js" "api.js" "blend.js" "cloudbar.js"
-    "cloudgl.js" "cloudhints.js" "cloudinput.js" "cloudlabels.js" "cloudscene.js" "cloudshaders.js"
-    "cloudsource.js" "cloudview.js" "colormap.js" "connection.js" "depthstats.js" "dom.js" "fit.js"
-    "hover.js" "icon.svg" "imagestats.js" "index.html" "keys.js" "labels.js" "layout.js" "lens.js"
-    "main.js" "matrix.js" "orbit.js" "painter.js" "plane.js" "protocol.js" "range.js" "recordbar.js"
-    "recording.js" "recordtext.js" "replaybar.js" "scenes.js" "slot.js" "sound.js" "style.css"
-    "thinning.js" "tile.js" "tilestate.js" "types.js" "view.css" "wall.js" "watch.js" "words.js"
+pub(super) static FILES: [File; 76] = files![
+    "advice.js" "aids.js" "aidsdepth.js" "aidsimage.js" "aidsoverlay.js" "api.js" "blend.js"
+    "boardoverlay.js" "calibrationpanel.js" "calibrationtext.js" "cloudbar.js" "cloudgl.js"
+    "cloudhints.js" "cloudinput.js" "cloudlabels.js" "cloudscene.js" "cloudshaders.js"
+    "cloudsource.js" "cloudview.js" "colormap.js" "connection.js" "controlrow.js" "controlspanel.js"
+    "controltext.js" "countdown.js" "dataset.js" "depthstats.js" "doctorpanel.js" "dom.js"
+    "doublepress.js" "eventstream.js" "fit.js" "hover.js" "icon.svg" "imagestats.js" "index.html"
+    "keys.js" "labels.js" "layout.js" "lens.js" "livestatus.js" "main.js" "matrix.js" "orbit.js"
+    "painter.js" "panels.css" "panels.js" "paneltypes.js" "plane.js" "protocol.js" "range.js"
+    "ready.js" "recordbar.js" "recording.js" "recordingrow.js" "recordings.js" "recordingtext.js"
+    "recordtext.js" "replaybar.js" "savedialog.js" "scenes.js" "skew.js" "slot.js" "sound.js"
+    "style.css" "syncpanel.js" "takes.js" "thinning.js" "tile.js" "tilestate.js" "types.js"
+    "usbtree.js" "view.css" "wall.js" "watch.js" "words.js"
 ];
 
+/// Where reports are, each below an address of its own: a tab that is opened cannot send the token.
+pub(super) const REPORT: &str = "/v1/report/";
 /// The WebSocket of the live page.
 pub(super) const LIVE: &str = "/v1/live";
 
@@ -44,19 +51,26 @@ pub struct PageAddress {
     pub url: Option<String>,
     /// The file with the token, which the user that runs the rig can read.
     pub token_file: Option<PathBuf>,
+    /// Where viewers with Foxglove's protocol find the rig, without the token that follows; `None` where that is off.
+    #[serde(default)]
+    pub foxglove: Option<String>,
 }
 
 impl PageAddress {
-    pub(super) fn of(tcp: Option<SocketAddr>, token: Option<&Path>) -> Self {
-        let url = tcp.map(|tcp| {
+    pub(super) fn of(tcp: Option<SocketAddr>, foxglove: Option<SocketAddr>, token: Option<&Path>) -> Self {
+        let url = |scheme: &str, tcp: SocketAddr| {
             // A page of another name has another origin, and another place for its token.
             if tcp.ip() == IpAddr::V4(Ipv4Addr::LOCALHOST) {
-                format!("http://localhost:{}/", tcp.port())
+                format!("{scheme}://localhost:{}/", tcp.port())
             } else {
-                format!("http://{tcp}/")
+                format!("{scheme}://{tcp}/")
             }
-        });
-        Self { url, token_file: token.map(Path::to_owned) }
+        };
+        Self {
+            url: tcp.map(|tcp| url("http", tcp)),
+            token_file: token.map(Path::to_owned),
+            foxglove: foxglove.map(|tcp| url("ws", tcp)),
+        }
     }
 }
 

@@ -2,21 +2,33 @@
 
 use super::events::{CaptureEvent, Events};
 use super::page::{self, LIVE, PageAddress};
+use super::recordings::{self, MarkRequest, NameRequest, Recording, Recordings, ReportPage, Tickets};
 use super::reply::Refusal;
+use super::requests::{
+    CameraRequest, FingerprintRequest, LoopRequest, NoteRequest, RateRequest, StepRequest,
+};
 use super::{SERVER_HEADER, allowed, guard, limits, live};
-use crate::control::{Control, RecordRequest, ReplayControl, SeekRequest};
+use crate::control::{
+    CameraControls, Control, ControlChanges, ControlList, ControlRequest, RecordRequest, ReplayControl,
+    SeekRequest, StopRequest,
+};
+use crate::doctor::Examined;
 use crate::metrics;
 use crate::status::{CameraState, CameraStatus, RecordingStatus, ReplayStatus, RigStatus};
 use crate::{Error, ErrorKind};
 use axum::body::Bytes;
-use axum::extract::{Request, State};
+use axum::extract::rejection::QueryRejection;
+use axum::extract::{Path as UrlPath, Query, Request, State};
 use axum::http::{HeaderValue, Method, StatusCode, Uri, header};
 use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{MethodRouter, get, post};
 use axum::{Extension, Json, Router};
+use depthrig_recorder::fs::RealFs;
+use depthrig_recorder::{SessionChanges, edit};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
+use std::path::Path;
 use std::sync::Arc;
 
 /// The OpenAPI 3.1 document of the API.
@@ -39,7 +51,7 @@ pub struct Route {
 const CALIBRATION_EVENTS: &str = "/v1/calibration/events";
 
 /// Every call of the API.
-pub const ROUTES: [Route; 20] = [
+pub const ROUTES: [Route; 31] = [
     Route { method: "GET", path: "/v1/status", handler: || get(status) },
     Route { method: "GET", path: "/v1/health", handler: || get(health) },
     Route { method: "GET", path: "/v1/config", handler: || get(config) },
@@ -47,6 +59,17 @@ pub const ROUTES: [Route; 20] = [
     Route { method: "POST", path: "/v1/record/start", handler: || post(record_start) },
     Route { method: "POST", path: "/v1/record/stop", handler: || post(record_stop) },
     Route { method: "POST", path: "/v1/record/note", handler: || post(record_note) },
+    Route { method: "GET", path: "/v1/recordings", handler: || get(recordings_list) },
+    Route { method: "GET", path: "/v1/recordings/image", handler: || get(recordings_image) },
+    Route { method: "POST", path: "/v1/recordings/mark", handler: || post(recordings_mark) },
+    Route { method: "POST", path: "/v1/recordings/report", handler: || post(recordings_report) },
+    Route { method: "GET", path: "/v1/report/{ticket}", handler: || get(report) },
+    Route { method: "GET", path: "/v1/doctor", handler: || get(doctor) },
+    Route { method: "GET", path: "/v1/controls", handler: || get(controls) },
+    Route { method: "POST", path: "/v1/controls", handler: || post(controls_set) },
+    Route { method: "POST", path: "/v1/controls/revert", handler: || post(controls_revert) },
+    Route { method: "GET", path: "/v1/controls/changes", handler: || get(controls_changes) },
+    Route { method: "POST", path: "/v1/controls/save", handler: || post(controls_save) },
     Route { method: "GET", path: "/v1/replay", handler: || get(replay) },
     Route { method: "POST", path: "/v1/replay/pause", handler: || post(replay_pause) },
     Route { method: "POST", path: "/v1/replay/resume", handler: || post(replay_resume) },
@@ -61,44 +84,6 @@ pub const ROUTES: [Route; 20] = [
     Route { method: "GET", path: "/v1/openapi.json", handler: || get(openapi) },
     Route { method: "GET", path: "/metrics", handler: || get(scrape) },
 ];
-
-/// A timed note for the recording.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct NoteRequest {
-    /// The text to note.
-    pub text: String,
-}
-
-/// How far to step in a replay.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct StepRequest {
-    /// Sets to play; negative: back.
-    pub sets: i64,
-}
-
-impl Default for StepRequest {
-    fn default() -> Self {
-        Self { sets: 1 }
-    }
-}
-
-/// A speed for a replay.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct RateRequest {
-    /// Against the original.
-    pub rate: f64,
-}
-
-/// Whether a replay begins again at its end.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct LoopRequest {
-    /// Whether.
-    pub on: bool,
-}
 
 /// Whether every camera streams.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -143,6 +128,7 @@ pub(super) fn router(control: Rig, events: Events) -> Router {
         .method_not_allowed_fallback(wrong_method)
         .with_state(control)
         .layer(Extension(events))
+        .layer(Extension(Tickets::default()))
         .layer(middleware::from_fn(limits::whole_body))
         .layer(middleware::from_fn(guard::json_posts))
         .layer(middleware::from_fn(name_server))
@@ -187,8 +173,82 @@ async fn record_start(State(rig): State<Rig>, body: Bytes) -> Answer<Json<Record
     .map(Json)
 }
 
-async fn record_stop(State(rig): State<Rig>) -> Answer<Json<RecordingStatus>> {
-    call(rig, |rig| rig.record_stop()).await.map(Json)
+async fn record_stop(State(rig): State<Rig>, body: Bytes) -> Answer<Json<RecordingStatus>> {
+    let request: StopRequest = parse(&body)?;
+    call(rig, move |rig| {
+        let status = rig.record_stop()?;
+        if let Some(mark) = request.mark {
+            let changes = SessionChanges { mark: Some(Some(mark)), ..SessionChanges::default() };
+            edit(&RealFs, Path::new(&status.path), &changes).map_err(|e| {
+                let what = format!("the recording is closed, and could not be marked {}: {e}", mark.name());
+                Error::new(ErrorKind::Other, what).with_source(e)
+            })?;
+        }
+        Ok(status)
+    })
+    .await
+    .map(Json)
+}
+
+async fn recordings_list(State(rig): State<Rig>) -> Answer<Json<Recordings>> {
+    call(rig, recordings::list).await.map(Json)
+}
+
+async fn recordings_image(
+    State(rig): State<Rig>,
+    of: Result<Query<NameRequest>, QueryRejection>,
+) -> Answer<Response> {
+    let Query(of) = of.map_err(|e| Refusal::new(StatusCode::BAD_REQUEST, e.body_text()))?;
+    call(rig, move |rig| recordings::image(rig, &of.name)).await
+}
+
+async fn recordings_mark(State(rig): State<Rig>, body: Bytes) -> Answer<Json<Recording>> {
+    let request: MarkRequest = parse(&body)?;
+    call(rig, move |rig| recordings::mark(rig, &request)).await.map(Json)
+}
+
+async fn recordings_report(
+    State(rig): State<Rig>,
+    Extension(tickets): Extension<Tickets>,
+    body: Bytes,
+) -> Answer<Json<ReportPage>> {
+    let of: NameRequest = parse(&body)?;
+    call(rig, move |rig| tickets.issue(rig, &of.name)).await.map(Json)
+}
+
+async fn report(
+    State(rig): State<Rig>,
+    Extension(tickets): Extension<Tickets>,
+    UrlPath(ticket): UrlPath<String>,
+) -> Answer<Response> {
+    call(rig, move |_| tickets.report(&ticket)).await
+}
+
+async fn controls(State(rig): State<Rig>) -> Answer<Json<ControlList>> {
+    call(rig, |rig| rig.controls()).await.map(Json)
+}
+
+async fn controls_set(State(rig): State<Rig>, body: Bytes) -> Answer<Json<CameraControls>> {
+    let request: ControlRequest = parse(&body)?;
+    call(rig, move |rig| rig.set_control(&request)).await.map(Json)
+}
+
+async fn controls_revert(State(rig): State<Rig>, body: Bytes) -> Answer<Json<CameraControls>> {
+    let of: CameraRequest = parse(&body)?;
+    call(rig, move |rig| rig.revert_controls(&of.camera)).await.map(Json)
+}
+
+async fn controls_changes(State(rig): State<Rig>) -> Answer<Json<ControlChanges>> {
+    call(rig, |rig| rig.control_changes()).await.map(Json)
+}
+
+async fn controls_save(State(rig): State<Rig>, body: Bytes) -> Answer<Json<ControlChanges>> {
+    let of: FingerprintRequest = parse(&body)?;
+    call(rig, move |rig| rig.save_controls(&of.fingerprint)).await.map(Json)
+}
+
+async fn doctor(State(rig): State<Rig>) -> Answer<Json<Examined>> {
+    call(rig, |rig| rig.doctor()).await.map(Json)
 }
 
 async fn record_note(State(rig): State<Rig>, body: Bytes) -> Answer<StatusCode> {

@@ -6,9 +6,10 @@ use super::live::Live;
 use super::page::PageAddress;
 use super::socket::{self, SocketFile};
 use super::token::{self, Token};
-use super::{MAX_CONNECTIONS, guard, routes};
-use crate::config::Port;
+use super::{MAX_CONNECTIONS, foxglove, guard, routes};
+use crate::config::ControlConfig;
 use crate::control::Control;
+use crate::foxglove::Foxglove;
 use crate::viewers::Viewers;
 use crate::{Error, ErrorKind, Result};
 use axum::{Extension, Router};
@@ -46,32 +47,42 @@ impl ServerHandle {
         control: Arc<dyn Control>,
         runtime_dir: &RuntimeDir,
         rig: &RigName,
-        port: Port,
+        ports: ControlConfig,
     ) -> Result<Self> {
         let path = runtime_dir.socket_path(rig);
         let failed = |e: std::io::Error| {
             Error::new(ErrorKind::Other, format!("the control API cannot be served: {e}")).with_source(e)
         };
-        // The port first: when it is refused, no socket has come and gone.
-        let port = socket::bind_port(port)?;
+        // The ports first: when one is refused, no socket has come and gone.
+        let port = socket::bind_port(ports.tcp, "control.tcp")?;
+        let foxglove = socket::bind_port(ports.foxglove, "control.foxglove")?;
         let (unix, socket) = socket::bind_unix(&path)?;
-        let tcp = port.as_ref().map(std::net::TcpListener::local_addr).transpose().map_err(failed)?;
-        let token = tcp.map(|_| Token::create(path.with_extension("token"))).transpose()?;
+        let address_of = |port: &Option<std::net::TcpListener>| {
+            port.as_ref().map(std::net::TcpListener::local_addr).transpose().map_err(failed)
+        };
+        let tcp = address_of(&port)?;
+        let foxglove_tcp = address_of(&foxglove)?;
+        let token = tcp.or(foxglove_tcp).map(|_| Token::create(path.with_extension("token"))).transpose()?;
         let mut builder = tokio::runtime::Builder::new_current_thread();
         let runtime = builder.enable_all().max_blocking_threads(CALL_THREADS).thread_name("api-call").build();
         let runtime = runtime.map_err(failed)?;
-        let (unix, port) = {
+        let listeners = {
             let _inside = runtime.enter();
-            let port = port.map(TcpListener::from_std).transpose().map_err(failed)?;
-            let port = port.zip(token.clone()).map(|(listener, token)| OnPort { listener, token });
-            (UnixListener::from_std(unix).map_err(failed)?, port)
+            let on_port = |port: Option<std::net::TcpListener>| -> Result<Option<OnPort>> {
+                let port = port.map(TcpListener::from_std).transpose().map_err(failed)?;
+                Ok(port.zip(token.clone()).map(|(listener, token)| OnPort { listener, token }))
+            };
+            let port = on_port(port)?;
+            let foxglove = on_port(foxglove)?;
+            Listeners { unix: UnixListener::from_std(unix).map_err(failed)?, port, foxglove }
         };
         let (stop, stopped) = watch::channel(false);
         let viewers = Viewers::new(runtime_dir.clone(), rig.clone());
-        let address = PageAddress::of(tcp, token.as_deref().map(Token::path));
-        let served = Served { control, viewers, address, stopped };
+        let foxglove = Foxglove::new(runtime_dir.clone(), rig.clone(), Arc::clone(&control));
+        let address = PageAddress::of(tcp, foxglove_tcp, token.as_deref().map(Token::path));
+        let served = Served { control, viewers, foxglove, address, stopped };
         let serve = move || {
-            runtime.block_on(run(served, unix, port));
+            runtime.block_on(run(served, listeners));
             // A call that is still under way ends by itself; nobody waits for its answer.
             runtime.shutdown_background();
         };
@@ -113,21 +124,31 @@ struct OnPort {
     token: Arc<Token>,
 }
 
+/// Where requests come in.
+struct Listeners {
+    unix: UnixListener,
+    port: Option<OnPort>,
+    foxglove: Option<OnPort>,
+}
+
 /// The rig, and what serves it.
 struct Served {
     control: Arc<dyn Control>,
     viewers: Viewers,
+    foxglove: Foxglove,
     address: PageAddress,
     stopped: watch::Receiver<bool>,
 }
 
-async fn run(served: Served, unix: UnixListener, port: Option<OnPort>) {
-    let Served { control, viewers, address, stopped } = served;
+async fn run(served: Served, listeners: Listeners) {
+    let Served { control, viewers, foxglove, address, stopped } = served;
+    let Listeners { unix, port, foxglove: foxglove_port } = listeners;
     let pages = Arc::new(Semaphore::new(MAX_CONNECTIONS));
     let live = |token: Option<Arc<Token>>| {
         let places = Arc::clone(&pages);
         Extension(Live { viewers: viewers.clone(), stopped: stopped.clone(), places, token })
     };
+    let rig = Arc::clone(&control);
     let router = routes::router(control, Events::new(stopped.clone()))
         .layer(Extension(address))
         .layer(axum::middleware::from_fn(guard::own_origin))
@@ -142,19 +163,37 @@ async fn run(served: Served, unix: UnixListener, port: Option<OnPort>) {
                 .layer(live(Some(Arc::clone(&token))))
                 .layer(axum::middleware::from_fn_with_state(token, token::bearer));
             let places = Arc::clone(&port_places);
-            let acceptor = Acceptor { places, router: guarded, stopped: stopped.clone() };
+            let acceptor =
+                Acceptor { places, router: guarded, stopped: stopped.clone(), write_timeout: WRITE_TIMEOUT };
             acceptor.run(async || listener.accept().await.map(|(stream, _)| stream)).await;
+        }
+    };
+    let foxglove_places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
+    let on_foxglove = async {
+        if let Some(OnPort { listener, token }) = foxglove_port {
+            let places = Arc::clone(&pages);
+            let viewers = foxglove::Service { foxglove, rig, stopped: stopped.clone(), places, token };
+            let acceptor = Acceptor {
+                places: Arc::clone(&foxglove_places),
+                router: foxglove::router(viewers),
+                stopped: stopped.clone(),
+                write_timeout: foxglove::WRITE_TIMEOUT,
+            };
+            acceptor.run(async || foxglove::accept(&listener).await).await;
         }
     };
     let on_socket = Acceptor {
         places: Arc::clone(&places),
         router: router.clone().layer(live(None)),
         stopped: stopped.clone(),
+        write_timeout: WRITE_TIMEOUT,
     };
-    tokio::join!(on_port, on_socket.run(async || unix.accept().await.map(|(stream, _)| stream)));
+    let on_socket = on_socket.run(async || unix.accept().await.map(|(stream, _)| stream));
+    tokio::join!(on_port, on_foxglove, on_socket);
     let all = async {
         let _ = places.acquire_many(MAX_CONNECTIONS as u32).await;
         let _ = port_places.acquire_many(MAX_CONNECTIONS as u32).await;
+        let _ = foxglove_places.acquire_many(MAX_CONNECTIONS as u32).await;
         let _ = pages.acquire_many(MAX_CONNECTIONS as u32).await;
     };
     if tokio::time::timeout(STOP_TIMEOUT, all).await.is_err() {
@@ -166,6 +205,8 @@ struct Acceptor {
     places: Arc<Semaphore>,
     router: Router,
     stopped: watch::Receiver<bool>,
+    /// How long a client may take to read an answer.
+    write_timeout: Duration,
 }
 
 impl Acceptor {
@@ -189,6 +230,7 @@ impl Acceptor {
             };
             let router = self.router.clone();
             let stopped = self.stopped.clone();
+            let stream = Limited::new(stream, self.write_timeout);
             tokio::spawn(async move {
                 converse(stream, router, stopped).await;
                 drop(place);
@@ -204,8 +246,8 @@ where
 {
     let mut http = hyper::server::conn::http1::Builder::new();
     http.timer(TokioTimer::new()).header_read_timeout(HEAD_TIMEOUT);
-    let stream = TokioIo::new(Limited::new(stream, WRITE_TIMEOUT));
-    let connection = http.serve_connection(stream, TowerToHyperService::new(router)).with_upgrades();
+    let connection =
+        http.serve_connection(TokioIo::new(stream), TowerToHyperService::new(router)).with_upgrades();
     tokio::pin!(connection);
     let ended = tokio::select! {
         ended = connection.as_mut() => ended,

@@ -58,14 +58,14 @@ fn make_way(path: &Path) -> Result<()> {
     })
 }
 
-/// Binds the configured port. With [`Port::Any`] a rig runs without one if no port is free.
-pub(super) fn bind_port(port: Port) -> Result<Option<TcpListener>> {
+/// Binds the port that `key` of the rig file configures. With [`Port::Any`] a rig runs without one if no port is free.
+pub(super) fn bind_port(port: Port, key: &str) -> Result<Option<TcpListener>> {
     match port {
         Port::Off => Ok(None),
-        Port::At(address) => bind_tcp(address).map(Some),
+        Port::At(address) => bind_tcp(address, key).map(Some),
         Port::Any => {
             let another = SocketAddr::new(Port::DEFAULT.ip(), 0);
-            let bound = bind_tcp(Port::DEFAULT).or_else(|_| bind_tcp(another));
+            let bound = bind_tcp(Port::DEFAULT, key).or_else(|_| bind_tcp(another, key));
             if let Err(e) = &bound {
                 tracing::warn!(error = %e, "the live page is not served");
             }
@@ -75,7 +75,7 @@ pub(super) fn bind_port(port: Port) -> Result<Option<TcpListener>> {
 }
 
 /// Binds the loopback address `address`.
-fn bind_tcp(address: SocketAddr) -> Result<TcpListener> {
+fn bind_tcp(address: SocketAddr, key: &str) -> Result<TcpListener> {
     if !address.ip().is_loopback() {
         let message =
             format!("control address {address} is not loopback; the API is not encrypted, use 127.0.0.1");
@@ -85,12 +85,12 @@ fn bind_tcp(address: SocketAddr) -> Result<TcpListener> {
     bound.map_err(|e| {
         let (kind, what) = match e.kind() {
             io::ErrorKind::AddrInUse => {
-                (ErrorKind::InUse, "another program listens there; change or remove control.tcp")
+                (ErrorKind::InUse, format!("another program listens there; change or remove {key}"))
             }
             io::ErrorKind::PermissionDenied => {
-                (ErrorKind::PermissionDenied, "this user may not; choose a port above 1023")
+                (ErrorKind::PermissionDenied, "this user may not; choose a port above 1023".to_owned())
             }
-            _ => (ErrorKind::Other, "it cannot be served"),
+            _ => (ErrorKind::Other, "it cannot be served".to_owned()),
         };
         Error::new(kind, format!("control address {address}: {what}: {e}")).with_source(e)
     })

@@ -1,7 +1,7 @@
 //! The token that requests over TCP must carry: other users of this computer reach the port, and only the user that runs
 //! the rig can read the token's file.
 
-use super::page::{self, LIVE};
+use super::page::{self, LIVE, REPORT};
 use super::reply::Refusal;
 use crate::{Error, ErrorKind, Result};
 use axum::extract::{Request, State};
@@ -77,10 +77,15 @@ impl Drop for Token {
     }
 }
 
-fn write_new(path: &Path) -> io::Result<String> {
+/// A text that nobody can guess.
+pub(super) fn random_text() -> io::Result<String> {
     let mut random = [0; BYTES];
     File::open("/dev/urandom")?.read_exact(&mut random)?;
-    let text = random.iter().fold(String::new(), |text, b| text + &format!("{b:02x}"));
+    Ok(random.iter().fold(String::new(), |text, b| text + &format!("{b:02x}")))
+}
+
+fn write_new(path: &Path) -> io::Result<String> {
+    let text = random_text()?;
     match std::fs::remove_file(path) {
         Err(e) if e.kind() != io::ErrorKind::NotFound => return Err(e),
         _ => {}
@@ -94,7 +99,9 @@ fn write_new(path: &Path) -> io::Result<String> {
 /// Refuses requests of a port without the token.
 pub(super) async fn bearer(State(token): State<Arc<Token>>, request: Request, next: Next) -> Response {
     let path = request.uri().path();
-    if path == OPEN_PATH || path == LIVE || page::is_page(path) || token.allows(&request) {
+    // The address of a report is a secret of its own.
+    let is_open = path == OPEN_PATH || path == LIVE || path.starts_with(REPORT) || page::is_page(path);
+    if is_open || token.allows(&request) {
         return next.run(request).await;
     }
     let message = format!(

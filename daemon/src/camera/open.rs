@@ -39,6 +39,7 @@ pub(super) fn open_session(
     let mut info = device.info().clone();
     let wanted = requests(camera, device.profiles());
     let stream = device.start(&wanted).map_err(in_camera)?;
+    set_again(camera, &*stream);
     let mut profiles = stream.profiles().to_vec();
     let calibrated = calibration::apply(&camera.config, &mut profiles, &mut info).map_err(in_camera)?;
     let pose = calibrated.pose;
@@ -72,6 +73,19 @@ pub(super) fn open_session(
     })?;
     let sink = BusSink::new(ports, Arc::clone(&shared.frames)).with_latencies(&calibrated.latencies);
     Ok(Session { info, stream, sink: Box::new(sink) })
+}
+
+/// Gives a camera that came back the controls that were changed before.
+fn set_again(camera: &Camera, stream: &dyn depthrig_driver::Stream) {
+    let panel = stream.controls();
+    camera.state().panel.clone_from(&panel);
+    let Some(panel) = panel.and_then(|panel| panel.upgrade()) else { return };
+    for (key, value) in lock(&camera.changed).iter() {
+        if let Err(e) = panel.set(key, value) {
+            let camera = camera.config.name.as_str();
+            tracing::warn!(camera, "{key} = {value} cannot be set again: {e}");
+        }
+    }
 }
 
 /// The streams to request of the device: those that the rig lists. Without a list it is every stream, at later openings

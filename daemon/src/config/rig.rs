@@ -127,16 +127,19 @@ fn recording(top: &Section<'_, '_>, base: &Path) -> RecordingConfig {
 
 fn control(top: &Section<'_, '_>) -> ControlConfig {
     let s = top.table("control", "[control]");
-    let tcp = s.or("tcp", Port::Any, |tcp: &Port| match tcp {
+    let d = ControlConfig::default();
+    let is_loopback = |port: &Port| match port {
         Port::At(a) if !a.ip().is_loopback() => Err(format!(
             "must be a loopback address such as 127.0.0.1:{}, not {a}: the API is not encrypted; forward a port over SSH \
              instead",
             a.port()
         )),
         _ => Ok(()),
-    });
+    };
+    let tcp = s.or("tcp", d.tcp, is_loopback);
+    let foxglove = s.or("foxglove", d.foxglove, is_loopback);
     s.finish();
-    ControlConfig { tcp }
+    ControlConfig { tcp, foxglove }
 }
 
 fn supervisor(top: &Section<'_, '_>) -> SupervisorConfig {
@@ -204,6 +207,9 @@ impl FromToml for PathBuf {
 
 impl FromToml for Port {
     fn from_toml(value: &toml::de::DeValue<'_>) -> Result<Self, String> {
+        if let toml::de::DeValue::Integer(_) = value {
+            return u16::from_toml(value).map(Self::loopback);
+        }
         let text = String::from_toml(value)?;
         if text == "off" {
             return Ok(Self::Off);

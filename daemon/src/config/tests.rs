@@ -150,6 +150,7 @@ fn what_a_file_says_is_what_comes_out() {
         sets = { rate_hz = 10, max_wait_ms = 40, phase = "fixed" }
         recording = { directory = "../out/./x", color = "png", depth = "rank", segment_max_s = 5, workers = 3 }
         control.tcp = "[::1]:8000"
+        control.foxglove = 8765
         [[camera]]
         name = "a"
         backend = "files"
@@ -175,6 +176,7 @@ fn what_a_file_says_is_what_comes_out() {
         (ColorCodec::Png, DepthCodec::Rank, 3, 5)
     );
     assert_eq!(rig.control.tcp, Port::At("[::1]:8000".parse().unwrap()));
+    assert_eq!(rig.control.foxglove, Port::At("127.0.0.1:8765".parse().unwrap()));
     let a = rig.camera("a").unwrap();
     let settings = FilesConfig { manifest: "/rigs/images".into(), rate_hz: Some(15.0), looped: Some(false) };
     assert_eq!(a.backend, BackendConfig::new(settings));
@@ -553,6 +555,8 @@ fn each_problem_has_its_place_and_says_what_to_write() {
         (top("sets.rate_hz = 0.0"), "1:16: \"rate_hz\" in [sets] is 0; it must be above 0"),
         (top("control.tcp = \"0.0.0.0:80\""), "1:15: \"tcp\" in [control] must be a loopback address such as 127.0.0.1:80, not 0.0.0.0:80: the API is not encrypted"),
         (top("control.tcp = \"localhost\""), "must be an address and a port such as"),
+        (top("control.foxglove = \"192.168.0.7:8765\""), "\"foxglove\" in [control] must be a loopback address such as 127.0.0.1:8765"),
+        (top("control.foxglove = 70000"), "must be a whole number within 0..=65535"),
         (top("bus.slots = 3"), "\"slots\" in [bus] is 3; it must be within 16 and 1024"),
         (top("recording.jpeg_quality = 101"), "is 101; it must be within 1 and 100"),
         (top("recording.jpeg_quality = 300"), "whole number within 0..=255"),

@@ -47,6 +47,7 @@ fn read(r: &Reader<'_>) -> SyntheticConfig {
         phase: field(s, "phase", d.phase, |c, v| c.phase = v),
         cache_dir: s.get::<PathBuf>("cache_dir").map_or(d.cache_dir, |f| resolve(r.base, &f.value)),
         cheap: field(s, "cheap", d.cheap, |c, v| c.cheap = v),
+        gain: field(s, "gain", d.gain, |c, v| c.gain = v),
         ring_frames: field(s, "ring_frames", d.ring_frames, |c, v| c.ring_frames = v),
         board: s.has("board").then(|| board(s, r.base)),
     };

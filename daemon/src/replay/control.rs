@@ -1,7 +1,7 @@
 //! A replay as the control API sees it: a rig whose cameras are datasets.
 
 use super::{Inner, lock};
-use crate::control::{Control, RecordRequest, ReplayControl, SeekRequest};
+use crate::control::{Control, LiveRig, RecordRequest, ReplayControl, SeekRequest};
 use crate::recording::{self, Begun, StreamFacts};
 use crate::rig::report;
 use crate::status::{
@@ -202,6 +202,7 @@ impl Control for Inner {
                 spread_p95_ms: ms(0.95),
                 spread_p99_ms: ms(0.99),
                 spread_max_ms: spreads.max_ns() as f64 / 1e6,
+                skews: Vec::new(),
             },
             recording,
             shared_memory: SharedMemoryStatus {
@@ -262,6 +263,15 @@ impl Control for Inner {
 
     fn record_note(&self, text: &str) -> Result<()> {
         lock(&self.recording).note(text)
+    }
+
+    fn live(&self) -> Option<LiveRig> {
+        let sources = lock(&self.sources);
+        let started = sources.session().started_utc_ns;
+        let offset = sources.utc_ns(HostTime::from_ns(0));
+        drop(sources);
+        let utc = UtcPair { mono: HostTime::from_ns(started - offset), utc_ns: started, width_ns: 0 };
+        Some(recording::live_rig(&self.config, self.stream_facts(), utc))
     }
 
     fn request_stop(&self) {

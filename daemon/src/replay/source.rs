@@ -64,8 +64,8 @@ impl Sources {
         let mut streams: Vec<StreamRecord> = Vec::new();
         let mut units: Vec<MotionRecord> = Vec::new();
         for path in paths {
-            let dataset = Dataset::open(path).map_err(of_dataset)?;
-            let reader = dataset.set_reader().map_err(of_dataset)?;
+            let dataset = Dataset::open(path).map_err(Error::from)?;
+            let reader = dataset.set_reader().map_err(Error::from)?;
             if reader.times().is_empty() {
                 let shown = path.display();
                 let why = reader.problems().first().map_or(String::new(), |p| format!(": {p}"));
@@ -262,7 +262,7 @@ fn utc_offset_ns(sources: &mut [Source]) -> Result<i64> {
         for n in 0..source.reader.times().len() {
             match source.reader.read(n, PixelMode::None) {
                 Ok(set) => return Ok(set.utc_offset_ns),
-                Err(e) if e.kind() == depthrig_recorder::ErrorKind::Io => return Err(of_dataset(e)),
+                Err(e) if e.kind() == depthrig_recorder::ErrorKind::Io => return Err(e.into()),
                 Err(_) => {}
             }
         }
@@ -332,14 +332,4 @@ fn take(
 
 fn bad(what: impl Into<String>) -> Error {
     Error::new(ErrorKind::BadInput, what)
-}
-
-fn of_dataset(e: depthrig_recorder::Error) -> Error {
-    use depthrig_recorder::ErrorKind as Rec;
-    let kind = match e.kind() {
-        Rec::NotFound => ErrorKind::NotFound,
-        Rec::PermissionDenied => ErrorKind::PermissionDenied,
-        _ => ErrorKind::Other,
-    };
-    Error::new(kind, e.to_string()).with_source(e)
 }

@@ -11,6 +11,7 @@ use crate::sets::{Assembler, AssemblerConfig, FrameSet, PhasePolicy};
 use crate::status::{CameraState, SetAccount};
 use crate::stream::Stream;
 use core::time::Duration;
+use depthrig_bus::sync::lock;
 use depthrig_bus::{Frame, HostTime, MemberRecord, SetHeader, SetPublisher, Subscriber};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -208,6 +209,13 @@ impl Assembly {
             tracing::error!(set = id, error = %e, "a frame set could not be sent");
         }
         self.inner.spreads().add(set.spread_ns);
+        let mut skews = lock(&self.inner.skews);
+        for (input, member) in self.inputs.iter().zip(&set.members) {
+            if let Some(member) = member {
+                skews.entry(input.stream.id.clone()).or_default().add(member.skew_ns);
+            }
+        }
+        drop(skews);
         self.inner.shared.stage.sets.note(set.tick, self.period_ns());
         let frames =
             self.inputs.iter().zip(set.members).map(|(i, m)| (Arc::clone(&i.stream), m.map(|m| m.item)));

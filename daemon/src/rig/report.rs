@@ -4,8 +4,8 @@ use super::Inner;
 use crate::camera::{Camera, State};
 use crate::stage;
 use crate::status::{
-    CameraState, CameraStatus, ClockStatus, PreparingStatus, RefineState, RigStatus, SetAccount, SetStatus,
-    SharedMemoryStatus, StreamStatus,
+    CameraState, CameraStatus, ClockStatus, PreparingStatus, RecordingStatus, RefineState, RigStatus,
+    SetAccount, SetStatus, SharedMemoryStatus, SkewStatus, StreamStatus,
 };
 use crate::stream::Stream;
 use depthrig_bus::sync::lock;
@@ -31,7 +31,7 @@ pub fn status(inner: &Inner) -> RigStatus {
         preparing: inner.drawing().map(preparing),
         cameras,
         sets: sets(inner),
-        recording: lock(&inner.recording).status(),
+        recording: recording(inner),
         shared_memory: SharedMemoryStatus {
             free_bytes: shm::free_bytes(shm::SHM_DIR.as_ref()).unwrap_or(0),
             slots: slots.unwrap_or(0),
@@ -40,6 +40,13 @@ pub fn status(inner: &Inner) -> RigStatus {
         cpu_cores: inner.cpu_millicores.load(Ordering::Relaxed) as f64 / 1000.0,
         replay: None,
     }
+}
+
+fn recording(inner: &Inner) -> Option<RecordingStatus> {
+    let mut status = lock(&inner.recording).status()?;
+    // Sets that wait for refined depth are still on their way to it.
+    status.closing |= status.active && inner.closing.load(Ordering::Relaxed);
+    Some(status)
 }
 
 fn preparing(progress: DrawingProgress) -> PreparingStatus {
@@ -63,6 +70,14 @@ fn sets(inner: &Inner) -> SetStatus {
         spread_p95_ms: ms(spreads.quantile_ns(0.95)),
         spread_p99_ms: ms(spreads.quantile_ns(0.99)),
         spread_max_ms: ms(spreads.max_ns()),
+        skews: lock(&inner.skews)
+            .iter()
+            .map(|(id, skews)| SkewStatus {
+                stream: id.to_string(),
+                median_ms: ms(skews.median_ns()),
+                p95_ms: ms(skews.quantile_ns(0.95)),
+            })
+            .collect(),
     }
 }
 

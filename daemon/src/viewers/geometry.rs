@@ -1,4 +1,4 @@
-//! What a viewer needs to put the pixels of a stream in their place.
+//! Size, intrinsics and pose of a stream, with which a viewer puts its pixels in their place.
 
 use depthrig_bus::{Distortion, FrameHeader, Intrinsics, Pose};
 use serde::{Serialize, Serializer};

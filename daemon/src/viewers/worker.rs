@@ -1,10 +1,11 @@
 //! The thread that encodes.
 
+use super::newest::{Newest, next_turn};
 use super::{Geometry, Head, Measured, Message, OfStream, Shared, State, Viewer, Watched, pixel};
 use crate::priority;
 use core::time::Duration;
 use depthrig_bus::sync::lock;
-use depthrig_bus::{Bus, Frame, HostTime, StreamId, Subscriber};
+use depthrig_bus::{Bus, HostTime, StreamId};
 use depthrig_recorder::preview::{Preview, measure, preview};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::PoisonError;
@@ -12,8 +13,6 @@ use tokio::sync::mpsc::error::TrySendError;
 
 /// Pause between two looks at a stream whose next frame somebody waits for.
 const POLL: Duration = Duration::from_millis(5);
-/// Pause before a stream that does not exist is looked for again.
-const RETRY: Duration = Duration::from_millis(500);
 /// Pause between two measurements of a stream.
 const MEASURE_PERIOD: Duration = Duration::from_millis(200);
 /// The longest wait, when no viewer has credit.
@@ -35,10 +34,7 @@ pub(super) fn run(shared: &Shared) {
 }
 
 struct Worker {
-    bus: Bus,
-    streams: BTreeMap<StreamId, Source>,
-    /// The newest frame of each stream.
-    frames: BTreeMap<StreamId, Frame>,
+    newest: Newest,
     /// The images encoded last, for viewers that come a little later.
     encoded: BTreeMap<Size, Encoded>,
     /// The numbers measured last.
@@ -47,7 +43,7 @@ struct Worker {
 
 /// Numbers of a stream's frame.
 struct Numbers {
-    /// When they may be measured anew.
+    /// Earliest time of the next measurement.
     due: HostTime,
     /// `None` if it could not be measured.
     measured: Option<Measured>,
@@ -67,13 +63,6 @@ struct Encoded {
     image: Option<Preview>,
 }
 
-/// A watched stream.
-enum Source {
-    Open(Box<Subscriber>),
-    /// It does not exist; when to look again.
-    Missing(HostTime),
-}
-
 /// An image that is to be sent.
 struct Job {
     viewer: u64,
@@ -88,13 +77,7 @@ struct Job {
 
 impl Worker {
     const fn new(bus: Bus) -> Self {
-        Self {
-            bus,
-            streams: BTreeMap::new(),
-            frames: BTreeMap::new(),
-            encoded: BTreeMap::new(),
-            measured: BTreeMap::new(),
-        }
+        Self { newest: Newest::new(bus), encoded: BTreeMap::new(), measured: BTreeMap::new() }
     }
 
     fn run(mut self, shared: &Shared) {
@@ -109,12 +92,13 @@ impl Worker {
                 }
                 all
             };
-            self.streams.retain(|id, _| watched.contains(id));
-            self.frames.retain(|id, _| watched.contains(id));
+            self.newest.keep(&watched);
             self.encoded.retain(|size, _| watched.contains(&size.id));
             self.measured.retain(|id, _| watched.contains(id));
             for id in watched {
-                self.take_newest(id, shared);
+                if let Err(e) = self.newest.take(&id) {
+                    tell(shared, &id, &e);
+                }
             }
             self.answer(shared);
             let jobs = self.due(&lock(&shared.state));
@@ -128,42 +112,13 @@ impl Worker {
         }
     }
 
-    /// Takes the newest frame of a stream.
-    fn take_newest(&mut self, id: StreamId, shared: &Shared) {
-        let source = self.streams.entry(id.clone()).or_insert_with(|| Source::Missing(HostTime::now()));
-        if let Source::Missing(again) = source
-            && again.from_now().is_zero()
-        {
-            match self.bus.subscriber(&id) {
-                Ok(subscriber) => *source = Source::Open(Box::new(subscriber)),
-                Err(e) => {
-                    *source = Source::Missing(HostTime::now().plus(RETRY));
-                    // A camera that is being opened has no channel yet; its state says so.
-                    if e.kind() != depthrig_bus::ErrorKind::NotFound {
-                        tell(shared, &id, &e);
-                    }
-                }
-            }
-        }
-        let Source::Open(subscriber) = source else { return };
-        match subscriber.latest() {
-            Ok(Some(frame)) => drop(self.frames.insert(id, frame)),
-            Ok(None) => {}
-            Err(e) => {
-                // Its publisher may have begun anew.
-                *source = Source::Missing(HostTime::now().plus(RETRY));
-                tell(shared, &id, &e);
-            }
-        }
-    }
-
     fn answer(&self, shared: &Shared) {
         let mut state = lock(&shared.state);
         let questions: Vec<_> =
             state.viewers.iter_mut().flat_map(|(n, v)| v.questions.drain(..).map(|q| (*n, q))).collect();
         drop(state);
         for (viewer, question) in questions {
-            let answer = pixel::answer(question, &self.frames);
+            let answer = pixel::answer(question, self.newest.frames());
             if let Some(viewer) = lock(&shared.state).viewers.get(&viewer) {
                 // One that does not read gets no answer.
                 let _ = viewer.to.try_send(Message::Pixel(answer));
@@ -177,7 +132,7 @@ impl Worker {
         let mut jobs = Vec::new();
         for (number, viewer) in state.viewers.iter().filter(|(_, v)| v.credits > 0) {
             for (index, watched) in viewer.watched.iter().enumerate() {
-                let newest = self.frames.get(&watched.id).map(|f| f.header().sequence);
+                let newest = self.newest.frames().get(&watched.id).map(|f| f.header().sequence);
                 if watched.due <= now && newest.is_some() && newest != watched.sent {
                     let id = watched.id.clone();
                     let Watched { width, due, measure, .. } = *watched;
@@ -195,7 +150,7 @@ impl Worker {
             if lock(&shared.state).viewers.get(&job.viewer).is_none_or(|v| v.credits == 0) {
                 continue;
             }
-            let Some(frame) = self.frames.get(&job.id) else { continue };
+            let Some(frame) = self.newest.frames().get(&job.id) else { continue };
             let header = frame.header();
             let size = Size { id: job.id.clone(), width: job.width };
             if self.encoded.get(&size).is_none_or(|e| e.sequence != header.sequence) {
@@ -206,7 +161,7 @@ impl Worker {
             if job.measure {
                 self.measure(&job.id, shared);
             }
-            let Some(frame) = self.frames.get(&job.id) else { continue };
+            let Some(frame) = self.newest.frames().get(&job.id) else { continue };
             let header = frame.header();
             let image = self.encoded.get(&size).and_then(|e| e.image.as_ref());
             let mut state = lock(&shared.state);
@@ -243,7 +198,7 @@ impl Worker {
 
     /// Measures the newest frame of a stream, unless that was done a moment ago.
     fn measure(&mut self, id: &StreamId, shared: &Shared) {
-        let Some(frame) = self.frames.get(id) else { return };
+        let Some(frame) = self.newest.frames().get(id) else { return };
         let now = HostTime::now();
         if self.measured.get(id).is_some_and(|m| m.due > now) {
             return;
@@ -256,7 +211,7 @@ impl Worker {
 
     /// Sends what goes with an image: the geometry, when it is new to the viewer, and the numbers.
     fn describe(&self, viewer: &mut Viewer, job: &Job) {
-        let Some(frame) = self.frames.get(&job.id) else { return };
+        let Some(frame) = self.newest.frames().get(&job.id) else { return };
         let Some(watched) = viewer.watched.get_mut(job.index) else { return };
         let geometry = Geometry::of(frame.header());
         if watched.geometry != Some(geometry) {
@@ -292,16 +247,6 @@ fn pause(state: &State) -> Duration {
         }
     }
     pause
-}
-
-/// The next time at which a stream is sent with this period. It is the same for all viewers, so that an image is encoded once for all, and
-/// another one for each stream, so that not all are encoded at once.
-fn next_turn(id: &StreamId, period: Duration) -> HostTime {
-    let period = period.as_nanos() as i64;
-    let phase = i64::from(crc32fast::hash(id.to_string().as_bytes())) % period;
-    let now = HostTime::now().ns();
-    let into = (now - phase).rem_euclid(period);
-    HostTime::from_ns(now - into + period)
 }
 
 /// Says to all who watch a stream why it is not shown.

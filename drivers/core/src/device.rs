@@ -1,8 +1,10 @@
 //! The traits that every camera family implements, and what a device says of itself.
 
+use crate::controls::ControlPanel;
 use crate::{Error, ErrorKind, FrameSink, Result};
 use core::time::Duration;
 use depthrig_bus::{ClockDomain, Intrinsics, MetadataLevel, PixelFormat, Pose, StreamName};
+use std::sync::Weak;
 
 /// A camera family: finds devices and opens them.
 pub trait Backend: Send {
@@ -54,6 +56,11 @@ pub trait Stream: Send {
     /// after any of them the stream is unusable and must be dropped. A damaged frame is not an error but a
     /// counted drop.
     fn poll(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> Result<Poll>;
+
+    /// The controls that can be changed while it streams, as long as it does; `None` when the driver sets them at the start alone.
+    fn controls(&self) -> Option<Weak<dyn ControlPanel>> {
+        None
+    }
 }
 
 /// Result of [`Stream::poll`].

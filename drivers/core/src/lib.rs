@@ -9,6 +9,7 @@
 pub mod bytes;
 pub mod capture;
 pub mod clock;
+pub mod controls;
 mod device;
 mod error;
 pub mod file_pattern;

@@ -7,6 +7,7 @@ use super::find::FoundCamera;
 use super::imu::{Unit, choose_imu, separated};
 use super::launch::{Launch, in_camera};
 use super::memory::Memory;
+use super::panel::Panel;
 use super::profiles::{self, Basis};
 use super::protocol::advanced::{self, UnitOrigin};
 use super::protocol::gvd::Gvd;
@@ -173,8 +174,7 @@ impl RealsenseDevice {
                     "color_controls are set, but colour is not among the streams",
                 ));
             }
-            let function = if found.model.color_module { Function::Color } else { Function::Stereo };
-            color = Some(transport.image_controls(function)?);
+            color = Some(transport.image_controls(color_function(found))?);
         }
         options::apply(
             config,
@@ -206,14 +206,28 @@ impl Device for RealsenseDevice {
         };
         self.configure(&label, &profiles).map_err(in_camera)?;
         self.warn_of_scaled(&label, &profiles);
+        let panel = self.panel(&label, &profiles);
         let Self { mut transport, monitor, memory, .. } = *self;
         let family = Family::D4xx;
-        let launch = Launch { family, label: label.clone(), profiles, plan, monitor, memory, imu };
+        let launch = Launch { family, label: label.clone(), profiles, plan, monitor, memory, imu, panel };
         launch.start(transport.as_mut()).map_err(in_camera)
     }
 }
 
 impl RealsenseDevice {
+    /// The controls for use while it streams; without them it streams all the same.
+    fn panel(&mut self, label: &str, chosen: &[StreamProfile]) -> Option<Arc<Panel>> {
+        let has_color = chosen.iter().any(|p| p.stream.as_str() == "color");
+        let color = has_color.then(|| color_function(&self.found));
+        match Panel::new(label.to_owned(), self.transport.as_mut(), color) {
+            Ok(panel) => Some(Arc::new(panel)),
+            Err(e) => {
+                tracing::info!(camera = %label, "its controls cannot be changed while it streams: {e}");
+                None
+            }
+        }
+    }
+
     /// A size that the calibration has no entry for gets scaled intrinsics, which is worth knowing.
     fn warn_of_scaled(&self, label: &str, chosen: &[StreamProfile]) {
         for p in chosen {
@@ -232,6 +246,11 @@ impl RealsenseDevice {
             }
         }
     }
+}
+
+/// The function that has the colour image.
+const fn color_function(found: &FoundCamera) -> Function {
+    if found.model.color_module { Function::Color } else { Function::Stereo }
 }
 
 /// Metres per unit of depth, after it was set if the rig asks for that.

@@ -4,6 +4,7 @@ use super::control::Control;
 use super::family::Family;
 use super::imu::Unit;
 use super::memory::Memory;
+use super::panel::Panel;
 use super::profiles::{self, Plan};
 use super::protocol::hwm::HardwareMonitor;
 use super::stream::{Parts, RealsenseStream, StreamState};
@@ -27,6 +28,8 @@ pub(super) struct Launch {
     pub(super) memory: Arc<Memory>,
     /// The IMU and the mode that it is to have.
     pub(super) imu: Option<(Unit, StreamProfile)>,
+    /// Its controls, if they can be changed while it streams.
+    pub(super) panel: Option<Arc<Panel>>,
 }
 
 impl Launch {
@@ -35,7 +38,7 @@ impl Launch {
     /// # Errors
     /// Those of [`Transport::start`].
     pub(super) fn start(self, transport: &mut dyn Transport) -> Result<Box<dyn Stream>> {
-        let Self { family, label, mut profiles, plan, monitor, memory, imu } = self;
+        let Self { family, label, mut profiles, plan, monitor, memory, imu, panel } = self;
         // The images' place in the list of streams is before that of the IMU.
         let imu = match imu {
             Some((unit, profile)) => {
@@ -73,7 +76,8 @@ impl Launch {
         profiles.extend(imu_profile);
         let port = transport.control(Function::Stereo)?;
         let control = Control::spawn(label.clone(), family, monitor, port)?;
-        let parts = Parts { label, images: started.images, profiles, streams, sources, control, memory, imu };
+        let parts =
+            Parts { label, images: started.images, profiles, streams, sources, control, memory, imu, panel };
         Ok(Box::new(RealsenseStream::new(parts)))
     }
 }

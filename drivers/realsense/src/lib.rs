@@ -22,6 +22,7 @@ mod libusb;
 mod memory;
 pub mod models;
 mod options;
+mod panel;
 mod profiles;
 pub mod protocol;
 mod stream;

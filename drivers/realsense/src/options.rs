@@ -5,21 +5,29 @@ use super::protocol::hwm::UNIT_ID;
 use super::transport::ImageControls;
 use core::time::Duration;
 use depthrig_driver::{Error, ErrorKind, Result};
-use depthrig_usb::controls::{Control, ControlKind, ControlValue};
+use depthrig_usb::controls::{Control, ControlKind, ControlState, ControlValue};
 use depthrig_usb::uvc::control::{ControlPort, Query};
 
 /// A number in the extension unit of the stereo module (librealsense `src/ds/ds-private.h`).
 #[derive(Debug, Clone, Copy)]
-struct UnitControl {
+pub(super) struct UnitControl {
     selector: u8,
     key: &'static str,
     unit: &'static str,
+    kind: ControlKind,
 }
 
-const EMITTER: UnitControl = UnitControl { selector: 2, key: "emitter", unit: "" };
-const EXPOSURE: UnitControl = UnitControl { selector: 3, key: "exposure_us", unit: " µs" };
-const LASER_POWER: UnitControl = UnitControl { selector: 4, key: "laser_power_mw", unit: " mW" };
-const AUTO_EXPOSURE: UnitControl = UnitControl { selector: 0x0B, key: "auto_exposure", unit: "" };
+const EMITTER: UnitControl = UnitControl { selector: 2, key: "emitter", unit: "", kind: ControlKind::Menu };
+const EXPOSURE: UnitControl =
+    UnitControl { selector: 3, key: "exposure_us", unit: " µs", kind: ControlKind::Integer };
+const LASER_POWER: UnitControl =
+    UnitControl { selector: 4, key: "laser_power_mw", unit: " mW", kind: ControlKind::Integer };
+const AUTO_EXPOSURE: UnitControl =
+    UnitControl { selector: 0x0B, key: "auto_exposure", unit: "", kind: ControlKind::Boolean };
+/// All of them.
+pub(super) const UNIT_CONTROLS: [UnitControl; 4] = [AUTO_EXPOSURE, EXPOSURE, EMITTER, LASER_POWER];
+/// The emitter's values in the order of their numbers, as rig files name them.
+const EMITTERS: [&str; 4] = ["off", "laser", "auto", "led"];
 
 /// Times that a camera which says "not now" is asked again.
 const TRIES: u32 = 5;
@@ -65,7 +73,61 @@ pub(super) fn apply(
     Ok(())
 }
 
+/// Changes a control of the extension unit. By hand means by hand: the camera ignores an exposure while its automatic is on.
+///
+/// # Errors
+/// As [`apply`].
+pub(super) fn set_unit(control: UnitControl, port: &mut dyn ControlPort, value: &ControlValue) -> Result<()> {
+    let number = control.state(port)?.control.check(value)?;
+    if control.selector == EXPOSURE.selector {
+        AUTO_EXPOSURE.set(port, 0)?;
+    }
+    // The camera's range is below 2^32.
+    control.set(port, number as u32)
+}
+
 impl UnitControl {
+    pub(super) const fn key(self) -> &'static str {
+        self.key
+    }
+
+    /// Its range and its value.
+    pub(super) fn state(self, port: &mut dyn ControlPort) -> Result<ControlState> {
+        let length = patiently(|| port.length(UNIT_ID, self.selector))?;
+        let mut read = |query: Query| -> Result<i64> {
+            let mut bytes = [0; 4];
+            let value = bytes.get_mut(..length.min(4)).unwrap_or_default();
+            patiently(|| port.query(UNIT_ID, self.selector, query, value))?;
+            Ok(u32::from_le_bytes(bytes).into())
+        };
+        let minimum = read(Query::GetMin)?;
+        let maximum = read(Query::GetMax)?;
+        let step = read(Query::GetRes)?;
+        let default = read(Query::GetDef)?;
+        let value = read(Query::GetCur)?;
+        let items = match self.kind {
+            ControlKind::Menu => {
+                let named = EMITTERS.iter().zip(0..).filter(|(_, n)| (minimum..=maximum).contains(n));
+                named.map(|(name, n)| (n, (*name).to_owned())).collect()
+            }
+            _ => Vec::new(),
+        };
+        let control = Control {
+            id: self.selector.into(),
+            name: self.key.to_owned(),
+            kind: self.kind,
+            minimum,
+            maximum,
+            step: step.max(1) as u64,
+            default,
+            read_only: false,
+            write_only: false,
+            inactive: false,
+            items,
+        };
+        Ok(ControlState { key: self.key.to_owned(), control, value: Some(value) })
+    }
+
     fn set(self, port: &mut dyn ControlPort, value: u32) -> Result<()> {
         let key = self.key;
         let no_such = |e: Error| match e.kind() {

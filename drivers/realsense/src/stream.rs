@@ -4,13 +4,15 @@ use super::account::{Account, Facts, Stamped};
 use super::control::Control;
 use super::imu::Imu;
 use super::memory::Memory;
+use super::panel::Panel;
 use core::time::Duration;
 use depthrig_bus::{DropReason, FrameFlags, HostTime};
+use depthrig_driver::controls::ControlPanel;
 use depthrig_driver::{
     Error, ErrorKind, FrameSink, Gate, Poll, RawFrame, Result, Stream, StreamProfile, unpack,
 };
 use depthrig_usb::video::{Image, ImageSource};
-use std::sync::Arc;
+use std::sync::{Arc, Weak};
 
 /// How the bytes of a source become the pixels of a stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -57,6 +59,7 @@ pub(super) struct Parts {
     pub(super) control: Control,
     pub(super) memory: Arc<Memory>,
     pub(super) imu: Option<Imu>,
+    pub(super) panel: Option<Arc<Panel>>,
 }
 
 /// A streaming D400.
@@ -70,13 +73,14 @@ pub(super) struct RealsenseStream {
     control: Control,
     memory: Arc<Memory>,
     imu: Option<Imu>,
+    panel: Option<Arc<Panel>>,
     began: HostTime,
     last_image: Option<HostTime>,
 }
 
 impl RealsenseStream {
     pub(super) fn new(parts: Parts) -> Self {
-        let Parts { label, images, profiles, mut streams, sources, control, memory, imu } = parts;
+        let Parts { label, images, profiles, mut streams, sources, control, memory, imu, panel } = parts;
         for stream in &mut streams {
             stream.gate.clock().expect_probes();
         }
@@ -89,6 +93,7 @@ impl RealsenseStream {
             control,
             memory,
             imu,
+            panel,
             began: HostTime::now(),
             last_image: None,
         }
@@ -137,6 +142,7 @@ impl Stream for RealsenseStream {
             // Whatever failed, the device is let go at once.
             self.images = None;
             self.imu = None;
+            self.panel = None;
             return Err(Error::new(e.kind(), format!("{}: {e}", self.label)).with_source(e));
         }
         if any {
@@ -148,10 +154,16 @@ impl Stream for RealsenseStream {
         if let Some(e) = self.imu.as_mut().filter(|_| self.streams.is_empty()).and_then(Imu::take_end) {
             self.images = None;
             self.imu = None;
+            self.panel = None;
             return Err(Error::new(e.kind(), format!("{}: its IMU is no longer read: {e}", self.label))
                 .with_source(e));
         }
         Ok(if any || batch { Poll::Frame } else { Poll::Idle })
+    }
+
+    fn controls(&self) -> Option<Weak<dyn ControlPanel>> {
+        let panel = Arc::downgrade(self.panel.as_ref()?);
+        Some(panel)
     }
 }
 

@@ -13,6 +13,7 @@ mod color;
 mod config;
 mod depth;
 mod drawing;
+mod gain;
 pub mod imu;
 pub mod models;
 mod motion;

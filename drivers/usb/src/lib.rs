@@ -3,7 +3,6 @@
 //! ([`video`]).
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
 
-pub mod controls;
 #[cfg(any(test, feature = "testing"))]
 pub mod fake;
 pub mod health;
@@ -13,5 +12,6 @@ mod tree;
 pub mod uvc;
 pub mod video;
 
+pub use depthrig_driver::controls;
 pub use root::SysRoot;
 pub use tree::{PowerControl, UsbDevice, UsbInterface, VideoNode, scan, video_nodes};

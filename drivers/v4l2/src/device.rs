@@ -152,10 +152,11 @@ impl Device for V4l2Device {
         let config = self.config.clone();
         let root = self.root.clone();
         let found = self.found.clone();
+        let nodes = self.nodes.iter().map(|pair| pair.video.path().to_owned()).collect();
         let ready = self.prepare(&chosen)?;
         let clock_hz = config.device_clock_hz.or_else(|| found.clock_hz(&root));
         let stream =
-            V4l2Stream::start(name, ready, &config, clock_hz).map_err(|e| named(&root, &found, e))?;
+            V4l2Stream::start(name, ready, &config, clock_hz, nodes).map_err(|e| named(&root, &found, e))?;
         Ok(Box::new(stream))
     }
 }

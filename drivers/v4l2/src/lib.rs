@@ -36,6 +36,7 @@ mod lent;
 mod metadata;
 mod node;
 mod offer;
+mod panel;
 mod queue;
 mod source;
 mod stream;

@@ -5,16 +5,19 @@ use super::lent::{Filled, LentSource, Refused};
 use super::metadata::MetadataFormat;
 use super::node::{Layout, Mode, Node};
 use super::offer::{Offer, kernel_clock};
+use super::panel::Panel;
 use super::source::{Source, Stamp, Wanted};
 use super::tick::{self, Sample};
 use core::time::Duration;
 use depthrig_bus::{ClockDomain, DropReason, FrameFlags, HostTime, MetadataLevel, PixelFormat};
+use depthrig_driver::controls::ControlPanel;
 use depthrig_driver::{
     DeviceClock, FrameSink, Gate, Loan, Outcome, Poll, RawFrame, Result, Stream, StreamProfile, unpack,
 };
 use depthrig_usb::uvc::payload::PayloadHeader;
 use depthrig_usb::video::{Image, ImageSource};
 use std::path::PathBuf;
+use std::sync::{Arc, Weak};
 
 /// How long the images for [`tick`] may take to come, together.
 const TICK_TIMEOUT: Duration = Duration::from_secs(1);
@@ -34,6 +37,7 @@ pub(super) struct V4l2Stream {
     streams: Vec<StreamState>,
     way: Way,
     buffers: u32,
+    panel: Arc<dyn ControlPanel>,
 }
 
 /// How images are received.
@@ -86,6 +90,7 @@ impl V4l2Stream {
         ready: Vec<Ready>,
         config: &V4l2Config,
         clock_hz: Option<u32>,
+        nodes: Vec<PathBuf>,
     ) -> Result<Self> {
         let mut profiles: Vec<StreamProfile> = ready.iter().map(|r| r.offer.profile.clone()).collect();
         let unpacks: Vec<Unpack> = ready.iter().map(|r| Unpack::of(&r.offer.profile, r.layout)).collect();
@@ -107,7 +112,8 @@ impl V4l2Stream {
                 clock,
             });
         }
-        Ok(Self { name, profiles, streams, way, buffers: config.buffers })
+        let panel = Arc::new(Panel { nodes });
+        Ok(Self { name, profiles, streams, way, buffers: config.buffers, panel })
     }
 
     /// Goes over to the kernel's buffers, for the reason given.
@@ -263,6 +269,10 @@ impl Stream for V4l2Stream {
             })?,
         };
         Ok(if any { Poll::Frame } else { Poll::Idle })
+    }
+
+    fn controls(&self) -> Option<Weak<dyn ControlPanel>> {
+        Some(Arc::downgrade(&self.panel))
     }
 }
 

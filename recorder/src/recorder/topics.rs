@@ -83,11 +83,11 @@ const fn motion_channel(streams: usize, unit: usize) -> u16 {
 }
 
 /// An IMU.
-pub(super) struct Unit {
+pub(crate) struct Unit {
     name: String,
-    pub(super) frame_id: String,
+    pub(crate) frame_id: String,
     /// The channel of its frame information; those of batches and samples follow.
-    pub(super) channel: u16,
+    pub(crate) channel: u16,
     /// Most samples of one batch.
     batch: u32,
 }
@@ -120,11 +120,11 @@ impl Topics {
         }
     }
 
-    pub(super) fn unit(&self, unit: usize) -> &Unit {
+    pub(crate) fn unit(&self, unit: usize) -> &Unit {
         &self.units[unit]
     }
 
-    pub(super) fn frame_id(&self, stream: usize) -> &str {
+    pub(crate) fn frame_id(&self, stream: usize) -> &str {
         &self.frame_ids[stream]
     }
 

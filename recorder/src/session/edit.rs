@@ -3,7 +3,7 @@
 //! Only `session.toml` changes, in one step; the segments keep the state at recording time. The file is
 //! edited as text: comments, order and keys that depthrig does not know stay as they are.
 
-use super::{Edit, Note, SESSION_FILE, Session, text_of};
+use super::{Edit, Mark, Note, SESSION_FILE, Session, text_of};
 use crate::dataset::segments_in;
 use crate::fs::{self, Fs};
 use crate::{Error, ErrorKind, Result};
@@ -27,6 +27,8 @@ pub struct SessionChanges {
     pub operator: Option<String>,
     /// Notes to add.
     pub notes: Vec<String>,
+    /// A person's judgement; `Some(None)` takes it back.
+    pub mark: Option<Option<Mark>>,
 }
 
 /// Changes the session of the dataset `dir` and returns what was changed; an equal value is not
@@ -53,6 +55,9 @@ pub fn edit(fs: &dyn Fs, dir: &Path, changes: &SessionChanges) -> Result<Vec<Edi
     }
     for note in &changes.notes {
         file.note(note)?;
+    }
+    if let Some(mark) = changes.mark {
+        file.mark(mark)?;
     }
     file.save()
 }
@@ -180,6 +185,19 @@ impl<'a> SessionText<'a> {
             }
         }
         self.log(key, before, after.to_owned())
+    }
+
+    fn mark(&mut self, mark: Option<Mark>) -> Result<()> {
+        let before = core::mem::replace(&mut self.session.mark, mark);
+        if before == mark {
+            return Ok(());
+        }
+        match mark {
+            Some(mark) => drop(self.document.insert("mark", toml_edit::value(mark.name()))),
+            None => drop(self.document.remove("mark")),
+        }
+        let name = |mark: Option<Mark>| mark.map_or("", Mark::name).to_owned();
+        self.log("mark", name(before), name(mark))
     }
 
     fn note(&mut self, text: &str) -> Result<()> {

@@ -9,7 +9,7 @@ use anyhow::Result;
 use depthrig_convert::recalibrate;
 use depthrig_recorder::fs::RealFs;
 use depthrig_recorder::utc_text;
-use depthrig_recorder::{Dataset, Edit, SessionChanges, edit, rename};
+use depthrig_recorder::{Dataset, Edit, Mark, SessionChanges, edit, rename};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
@@ -42,6 +42,9 @@ pub struct EditArgs {
     /// Add a note; repeatable
     #[arg(long = "note", value_name = "TEXT")]
     notes: Vec<String>,
+    /// Judge the recording; exports leave out what is marked bad
+    #[arg(long, value_enum, value_name = "MARK")]
+    mark: Option<MarkArg>,
     /// Calibration of the mount to attach
     #[arg(long, value_name = "FILE")]
     calibration: Option<PathBuf>,
@@ -51,6 +54,27 @@ pub struct EditArgs {
     /// Print JSON
     #[arg(long)]
     json: bool,
+}
+
+/// A judgement of a recording.
+#[derive(Debug, Clone, Copy, clap::ValueEnum)]
+enum MarkArg {
+    /// To be used
+    Good,
+    /// Not to be used
+    Bad,
+    /// Take the judgement back
+    None,
+}
+
+impl MarkArg {
+    const fn mark(self) -> Option<Mark> {
+        match self {
+            Self::Good => Some(Mark::Good),
+            Self::Bad => Some(Mark::Bad),
+            Self::None => None,
+        }
+    }
 }
 
 /// The new changes and the full history.
@@ -67,6 +91,7 @@ pub fn run(args: &EditArgs, context: &Context) -> Result<Exit> {
         scene: args.scene.clone(),
         operator: args.operator.clone(),
         notes: args.notes.clone(),
+        mark: args.mark.map(MarkArg::mark),
     };
     let asked = changes != SessionChanges::default() || args.rename.is_some() || args.calibration.is_some();
     let mut path = args.dataset.clone();

@@ -10,7 +10,7 @@ use anyhow::Result;
 use core::ops::ControlFlow;
 use depthrig_convert::{ExportOptions, ExportReport, Exporter, export};
 use depthrig_recorder::fs::RealFs;
-use depthrig_recorder::{Dataset, ErrorKind};
+use depthrig_recorder::{Dataset, ErrorKind, Mark};
 use std::path::PathBuf;
 
 mod bytecameradepth;
@@ -21,7 +21,7 @@ pub const EXAMPLES: &str = "\
 OUT is a new folder. Run the command again with the same datasets and options to resume an
 interrupted export; the result is the same as without the interruption. Nothing is ever
 overwritten. OUT/export.json, written last, lists what was exported and what was lost;
-docs/exchange.md describes each layout.
+docs/exchange.md describes each layout. Datasets marked bad (`depthrig edit DATASET --mark bad`) are left out.
 
 Exit codes: 0 success, 1 failed or interrupted, 2 wrong usage, 3 exported, but some sets, frames or
 pixels could not be.
@@ -79,7 +79,20 @@ pub fn run(command: &ExportCommand, context: &Context) -> Result<Exit> {
 fn drive(exporter: &mut dyn Exporter, common: &Common, context: &Context) -> Result<Exit> {
     let dir = &common.out;
     let open = |path: &PathBuf| common.corrected.of(Dataset::open(path)?);
-    let datasets = common.datasets.iter().map(open).collect::<Result<Vec<_>>>()?;
+    let mut datasets = common.datasets.iter().map(open).collect::<Result<Vec<_>>>()?;
+    datasets.retain(|dataset| {
+        let is_bad = dataset.session().mark == Some(Mark::Bad);
+        if is_bad {
+            let path = dataset.path().display();
+            out::note(format_args!(
+                "left out: {path} is marked bad (take it back with: depthrig edit {path} --mark none)"
+            ));
+        }
+        !is_bad
+    });
+    if datasets.is_empty() {
+        return Err(UsageError("every dataset is marked bad; there is nothing to export".to_owned()).into());
+    }
     let mut options = ExportOptions::default();
     if let Some(jobs) = common.jobs {
         options.workers = usize::from(jobs);

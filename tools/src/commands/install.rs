@@ -1,7 +1,7 @@
 //! `depthrig install`: installs udev rules, the USB transfer limit and the systemd service.
 
 use crate::exit::{Exit, UsageError};
-use crate::install::{Done, Service, State, files};
+use crate::install::{Done, Service, State, SystemFile, files};
 use crate::out;
 use anyhow::{Context, Result};
 use std::path::{Path, PathBuf};
@@ -61,6 +61,10 @@ pub fn run(args: &InstallArgs) -> Result<Exit> {
         for file in &files {
             let state = match file.state(&args.root) {
                 Ok(State::Missing) => "not installed".to_owned(),
+                Ok(State::Packaged) => format!("installed by the package{}", in_its_place(file, &args.root)),
+                Ok(State::PackagedOther) => {
+                    format!("not installed; the package has other contents{}", in_its_place(file, &args.root))
+                }
                 Ok(State::Current) => "installed".to_owned(),
                 Ok(State::Older) => "installed with other contents".to_owned(),
                 Ok(State::Changed) => "changed by hand".to_owned(),
@@ -85,6 +89,7 @@ pub fn run(args: &InstallArgs) -> Result<Exit> {
             Done::Removed => "removed",
             Done::Absent => "did not exist",
             Done::Refused => "was changed by hand and is kept; --overwrite replaces or removes it",
+            Done::Packaged => "left to the package, which brings it",
         };
         out::line(format_args!("{} ({}): {what}", file.below(&args.root).display(), file.what))?;
     }
@@ -96,6 +101,11 @@ pub fn run(args: &InstallArgs) -> Result<Exit> {
     Ok(if refused { Exit::Lost } else { Exit::Good })
 }
 
+/// The package's file in parentheses, for a message.
+fn in_its_place(file: &SystemFile, root: &Path) -> String {
+    file.packaged_below(root).map_or_else(String::new, |path| format!(" ({})", path.display()))
+}
+
 /// Commands that activate the files, in order.
 fn next_steps(service: &Service) -> String {
     let Service { user, rig_file, data, .. } = service;
@@ -104,7 +114,7 @@ fn next_steps(service: &Service) -> String {
     format!(
         "\
   udevadm control --reload && udevadm trigger --settle    (or replug the cameras)
-  systemd-tmpfiles --create /etc/tmpfiles.d/depthrig.conf
+  systemd-tmpfiles --create depthrig.conf
   usermod --append --groups video {user}                  (then {user} logs in again)
 
 For the service:

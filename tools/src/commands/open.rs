@@ -5,6 +5,7 @@ use crate::exit::Exit;
 use crate::out;
 use anyhow::{Context as _, Result, bail};
 use serde::Serialize;
+use std::path::Path;
 use std::process::{Command, Stdio};
 
 /// Examples for `--help`.
@@ -14,7 +15,8 @@ From another computer: `ssh -L 8642:localhost:8642 HOST`, and there the address 
 
 Examples:
   depthrig open
-  depthrig open --print --rig mount";
+  depthrig open --print --rig mount
+  depthrig open --foxglove        the address to open as \"Foxglove WebSocket\" in Foxglove or Lichtblick";
 
 /// Arguments.
 #[derive(Debug, clap::Args)]
@@ -25,6 +27,9 @@ pub struct OpenArgs {
     /// Print JSON and start no browser
     #[arg(long)]
     json: bool,
+    /// Print the address for Foxglove and Lichtblick instead
+    #[arg(long)]
+    foxglove: bool,
 }
 
 #[derive(Serialize)]
@@ -32,19 +37,39 @@ struct Address {
     url: String,
 }
 
+/// The token of a rig, from its file.
+fn token(file: &Path) -> Result<String> {
+    let token = std::fs::read_to_string(file)
+        .with_context(|| format!("{}: the token of the page cannot be read", file.display()))?;
+    Ok(token.trim_end().to_owned())
+}
+
 /// Finds the page and opens it.
 pub fn run(args: &OpenArgs, context: &Context) -> Result<Exit> {
     let client = super::record::connect(context)?;
     let page = client.page()?;
+    if args.foxglove {
+        let (Some(address), Some(token_file)) = (page.foxglove, page.token_file) else {
+            bail!(
+                "rig {} does not serve Foxglove; start it with --foxglove, or write foxglove = 8765 into [control]",
+                client.rig()
+            );
+        };
+        let url = format!("{address}{}", token(&token_file)?);
+        if args.json {
+            out::json(&Address { url })?;
+        } else {
+            out::line(&url)?;
+        }
+        return Ok(Exit::Good);
+    }
     let (Some(url), Some(token_file)) = (page.url, page.token_file) else {
         bail!(
             "rig {} serves no page: its configuration has tcp = \"off\" in [control], or no port was free; `depthrig top` shows it in the terminal",
             client.rig()
         );
     };
-    let token = std::fs::read_to_string(&token_file)
-        .with_context(|| format!("{}: the token of the page cannot be read", token_file.display()))?;
-    let url = format!("{url}#token={}", token.trim_end());
+    let url = format!("{url}#token={}", token(&token_file)?);
     if args.json {
         out::json(&Address { url })?;
         return Ok(Exit::Good);

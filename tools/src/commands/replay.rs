@@ -9,6 +9,7 @@ use anyhow::Result;
 use core::time::Duration;
 use depthrig_cdm::stage::EngineChoice;
 use depthrig_daemon::client::Client;
+use depthrig_daemon::config::Port;
 use depthrig_daemon::control::{RecordRequest, SeekRequest};
 use depthrig_daemon::replay::{Replay, ReplayOptions, ReplaySummary};
 use depthrig_daemon::status::ReplayStatus;
@@ -86,6 +87,9 @@ struct StartArgs {
     #[arg(long, value_name = "ENGINE", num_args = 0..=1, default_missing_value = "auto", require_equals = true,
           value_parser = engine, conflicts_with = "as_fast_as_possible")]
     refine: Option<EngineChoice>,
+    /// Serve Foxglove and Lichtblick on this loopback port [default without PORT: 8765]
+    #[arg(long, value_name = "PORT", num_args = 0..=1, default_missing_value = "8765", require_equals = true)]
+    foxglove: Option<u16>,
     /// Print JSON at the end
     #[arg(long)]
     json: bool,
@@ -203,6 +207,7 @@ const LINGER: Duration = Duration::from_millis(300);
 fn replay(args: &StartArgs, context: &Context) -> Result<Exit> {
     let stop = Stop::on_signals()?;
     let options = ReplayOptions {
+        in_background: false,
         rate: args.rate,
         looped: args.looped,
         from_s: args.from,
@@ -212,6 +217,7 @@ fn replay(args: &StartArgs, context: &Context) -> Result<Exit> {
         paused: args.paused || args.record.is_some(),
         hold: args.hold,
         refine: args.refine,
+        foxglove: args.foxglove.map_or(Port::Off, Port::loopback),
         serve_api: true,
     };
     let replay = Replay::start(&args.datasets, &context.runtime()?, context.global.rig.clone(), options)?;

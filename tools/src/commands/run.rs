@@ -10,8 +10,9 @@ use core::sync::atomic::{AtomicBool, Ordering};
 use core::time::Duration;
 use depthrig_bus::sync::lock;
 use depthrig_bus::{HostTime, RuntimeDir};
-use depthrig_daemon::config::RigConfig;
-use depthrig_daemon::control::{Control, RecordRequest};
+use depthrig_daemon::Showing;
+use depthrig_daemon::config::{Port, RigConfig};
+use depthrig_daemon::control::{Control, RecordRequest, Shows};
 use depthrig_daemon::rig::{Rig, RigOptions, RigSummary};
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
@@ -23,6 +24,7 @@ The first Ctrl-C or SIGTERM closes a recording and exits cleanly; a second one e
 Examples:
   depthrig run rig.toml
   depthrig run rig.toml --record data --seconds 60 --scene kitchen
+  depthrig run rig.toml --foxglove        then `depthrig open --foxglove` prints the address for the viewer
   depthrig run rig.toml --log-format json 2>> depthrig.log";
 
 /// Arguments.
@@ -45,6 +47,9 @@ pub struct RunArgs {
     /// Stop after N seconds
     #[arg(long, value_name = "N", value_parser = crate::args::positive_seconds)]
     seconds: Option<f64>,
+    /// Serve Foxglove and Lichtblick on this loopback port [default without PORT: 8765]
+    #[arg(long, value_name = "PORT", num_args = 0..=1, default_missing_value = "8765")]
+    foxglove: Option<u16>,
     /// Print the summary as JSON at the end
     #[arg(long)]
     json: bool,
@@ -55,6 +60,9 @@ pub fn run(args: &RunArgs, context: &Context) -> Result<Exit> {
     let mut config = RigConfig::load(&args.config).map_err(depthrig_daemon::Error::from)?;
     if let Some(rig) = &context.global.rig {
         config.rig = rig.clone();
+    }
+    if let Some(port) = args.foxglove {
+        config.control.foxglove = Port::loopback(port);
     }
     let stop = Stop::on_signals()?;
     let Started { rig, .. } = start(config, context.runtime()?, true, None, context.global.quiet > 0)?;
@@ -139,8 +147,10 @@ pub fn start(
         shown.0.set(&what, done as u64, total as u64);
         shown.1 = HostTime::now();
     };
+    let shows = serve_api.then(|| Showing::new(&runtime, &config.rig)).transpose()?;
     let options = RigOptions {
         serve_api,
+        shows: shows.map(|shows| Arc::new(shows) as Arc<dyn Shows>),
         cache_dir,
         progress: Some(Box::new(progress)),
         // With an API, subscribers can query the rendering progress, so streaming starts at once.

@@ -9,7 +9,7 @@ use clap::ValueEnum;
 use depthrig_daemon::client::Client;
 use depthrig_daemon::config::RecordingConfig;
 use depthrig_recorder::fs::RealFs;
-use depthrig_recorder::{CatalogEntry, Health, catalog};
+use depthrig_recorder::{CatalogEntry, Health, Mark, catalog};
 use std::path::{Path, PathBuf};
 use time::{OffsetDateTime, UtcOffset};
 
@@ -137,8 +137,11 @@ fn text(entries: &[CatalogEntry], folder: &str) -> String {
         return format!("no datasets in {folder}");
     }
     let mut lines = vec![out::table(
-        &["name", "scene", "operator", "start", "health", "length", "sets", "lost", "streams", "size"],
-        5,
+        &[
+            "name", "scene", "operator", "start", "health", "mark", "length", "sets", "lost", "streams",
+            "size",
+        ],
+        6,
         entries.iter().map(|e| {
             vec![
                 short(&e.name, 44),
@@ -146,6 +149,7 @@ fn text(entries: &[CatalogEntry], folder: &str) -> String {
                 short(&e.operator, 16),
                 e.started_utc_ns.map_or_else(|| "-".to_owned(), local),
                 e.health.name().to_owned(),
+                e.mark.map_or("-", Mark::name).to_owned(),
                 out::seconds(e.duration_ns as f64 / 1e9),
                 e.sets.to_string(),
                 e.sets_lost.to_string(),

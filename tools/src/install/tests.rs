@@ -73,6 +73,28 @@ fn another_user_or_folder_is_another_service_file_that_may_be_replaced() {
     );
 }
 
+/// The Debian package's files are not written a second time, and are not removed; a file in /etc takes their place.
+#[test]
+fn what_the_package_brings_is_seen_and_left_to_it() {
+    let root = tempfile::tempdir().unwrap();
+    let rules = &files(&service())[0];
+    let packaged = root.path().join("usr/lib/udev/rules.d/70-depthrig.rules");
+    std::fs::create_dir_all(packaged.parent().unwrap()).unwrap();
+    std::fs::copy("udev/70-depthrig.rules", &packaged).unwrap();
+    assert_eq!(rules.state(root.path()).unwrap(), State::Packaged);
+    assert_eq!(rules.install(root.path(), true).unwrap(), Done::Packaged);
+    assert!(!rules.below(root.path()).exists(), "a copy in /etc would outlive the package's next version");
+    assert_eq!(rules.remove(root.path(), true).unwrap(), Done::Packaged);
+    assert!(packaged.exists());
+
+    std::fs::write(&packaged, "# of another version\n").unwrap();
+    assert_eq!(rules.state(root.path()).unwrap(), State::PackagedOther);
+    assert_eq!(rules.install(root.path(), false).unwrap(), Done::Written);
+    assert_eq!(rules.state(root.path()).unwrap(), State::Current);
+    assert_eq!(rules.remove(root.path(), false).unwrap(), Done::Removed);
+    assert!(packaged.exists());
+}
+
 /// A camera that depthrig drives must be in the rules, or it works for root alone.
 #[test]
 fn the_rules_name_every_camera_that_has_a_driver() {

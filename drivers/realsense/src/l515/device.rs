@@ -156,8 +156,16 @@ impl Device for L515Device {
         let Self { opened: Opened { mut transport, monitor, .. }, memory, profiles: offered, unit, .. } =
             *self;
         let imu = choose_imu(&label, &offered, asked.imu.as_ref(), Some(unit))?;
-        let launch =
-            Launch { family: Family::L515, label: label.clone(), profiles, plan, monitor, memory, imu };
+        let launch = Launch {
+            family: Family::L515,
+            label: label.clone(),
+            profiles,
+            plan,
+            monitor,
+            memory,
+            imu,
+            panel: None,
+        };
         launch.start(transport.as_mut()).map_err(in_camera)
     }
 }

@@ -1,8 +1,9 @@
 //! The synthetic backend: simulated cameras behind the traits of every other one.
 
 use super::board::{Moment, Painter};
-use super::config::{FaultKind, SyntheticConfig};
+use super::config::{FaultKind, GAINS, SyntheticConfig};
 use super::drawing::Drawing;
+use super::gain::{self, Panel};
 use super::imu::{Batch, Filler};
 use super::pattern::Pattern;
 use super::profiles::Content;
@@ -11,14 +12,16 @@ use super::render::{self, Images};
 use super::unit::{DueFault, SimFrame, SimTruth, Unit};
 use super::view::Rays;
 use super::{NAME, motion, noise, overlay};
+use core::sync::atomic::Ordering;
 use core::time::Duration;
 use depthrig_bus::{DropReason, FrameFlags, HostTime};
 use depthrig_calib::PoseExt;
+use depthrig_driver::controls::ControlPanel;
 use depthrig_driver::{
     Backend, Device, DeviceInfo, Error, ErrorKind, FrameSink, Gate, Poll, RawFrame, Result, Stream,
     StreamProfile, StreamRequest, choose_profiles,
 };
-use std::sync::Arc;
+use std::sync::{Arc, Weak};
 
 /// The longest that a poll sleeps at a stretch, so that a fault injected meanwhile is noticed.
 const NAP: Duration = Duration::from_millis(20);
@@ -176,7 +179,8 @@ impl Device for SyntheticDevice {
             }
         });
         let streams = streams.collect();
-        Ok(Box::new(SyntheticStream { streams, profiles, hold: self.hold, is_gone: false }))
+        let panel = Arc::new(Panel(Arc::clone(unit)));
+        Ok(Box::new(SyntheticStream { streams, profiles, hold: self.hold, panel, is_gone: false }))
     }
 }
 
@@ -206,6 +210,7 @@ struct SyntheticStream {
     streams: Vec<StreamState>,
     profiles: Vec<StreamProfile>,
     hold: Hold,
+    panel: Arc<Panel>,
     is_gone: bool,
 }
 
@@ -244,6 +249,11 @@ impl Stream for SyntheticStream {
             let wake = next.min().map_or(deadline, |t| t.min(deadline));
             std::thread::sleep(wake.from_now().min(NAP));
         }
+    }
+
+    fn controls(&self) -> Option<Weak<dyn ControlPanel>> {
+        let panel = Arc::downgrade(&self.panel);
+        Some(panel)
     }
 }
 
@@ -307,7 +317,9 @@ impl SyntheticStream {
         let mut raw = RawFrame::new(sequence, waiting.ticks, waiting.arrival, bytes);
         raw.damaged = waiting.fault == Some(FaultKind::Damaged);
         raw.exposure_ns = waiting.exposure_ns;
-        raw.gain = if matches!(stream.source, Source::Motion(_)) { 0.0 } else { 16.0 };
+        let gain =
+            if stream.content == Content::Color { unit.gain.load(Ordering::Relaxed) } else { *GAINS.start() };
+        raw.gain = if matches!(stream.source, Source::Motion(_)) { 0.0 } else { gain as f32 };
         let warm_s = waiting.capture.since_ns(unit.world_start) as f32 * 1e-9;
         raw.temperature_c = 38.0 - 8.0 * (-warm_s / 300.0).exp();
         raw.flags = FrameFlags::SYNTHETIC;
@@ -328,7 +340,10 @@ impl SyntheticStream {
         stream.gate.deliver_timed(&raw, sink, |memory, meta| {
             match source {
                 Source::Motion(filler) => filler.fill(&batch, meta, memory),
-                Source::Pattern(pattern) => pattern.fill(sequence, memory),
+                Source::Pattern(pattern) => {
+                    pattern.fill(sequence, memory);
+                    gain::amplify(memory, gain);
+                }
                 Source::Images(images) => {
                     let image = images.get(pose);
                     if image.len() != memory.len() {
@@ -345,6 +360,7 @@ impl SyntheticStream {
                             }
                         }
                     }
+                    gain::amplify(memory, gain);
                     if has_strip {
                         overlay::draw(memory, width, sequence as u32);
                     }

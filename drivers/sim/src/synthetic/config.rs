@@ -1,11 +1,15 @@
 //! The configuration of a simulated camera, as plain values that a rig file maps onto.
 
 use super::board::BoardScene;
+use core::ops::RangeInclusive;
 use depthrig_bus::{Pose, StreamName};
 use depthrig_calib::PoseExt;
 use depthrig_driver::{Error, ErrorKind, Result};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
+
+/// Gains of the colour camera; at the least one images are as they are rendered.
+pub(crate) const GAINS: RangeInclusive<u32> = 16..=128;
 
 /// One simulated camera.
 ///
@@ -41,6 +45,8 @@ pub struct SyntheticConfig {
     pub cache_dir: PathBuf,
     /// No images: a pattern that costs one memory copy per frame and can be checked. Any size is allowed.
     pub cheap: bool,
+    /// Gain of the colour camera, 16 to 128; 16 shows the scene as it is rendered. Can be changed while it streams.
+    pub gain: u32,
     /// Frames that the device keeps while nobody fetches them; older ones are lost.
     pub ring_frames: u32,
     /// A printed board in front of the mount, which then stands still.
@@ -64,6 +70,7 @@ impl Default for SyntheticConfig {
             phase: 0.0,
             cache_dir: default_cache_dir(),
             cheap: false,
+            gain: *GAINS.start(),
             ring_frames: 8,
             board: None,
         }
@@ -252,6 +259,9 @@ impl SyntheticConfig {
             Some("pose_on_mount has a value that is not finite".to_owned())
         } else if !(2..=1024).contains(&self.ring_frames) {
             Some(format!("ring_frames = {} is out of range 2..=1024", self.ring_frames))
+        } else if !GAINS.contains(&self.gain) {
+            let range = &GAINS;
+            Some(format!("gain = {} is out of range {range:?}", self.gain))
         } else if !(16..=64).contains(&c.counter_bits) {
             Some(format!("clock.counter_bits = {} is out of range 16..=64", c.counter_bits))
         } else if !(c.drift_ppm.abs() <= 10_000.0 && c.thermal_ppm.abs() <= 10_000.0) {

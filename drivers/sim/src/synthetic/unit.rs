@@ -9,6 +9,7 @@ use super::drawing::Drawing;
 use super::models::Model;
 use super::profiles::model_of;
 use super::timeline::{Boot, Timeline};
+use core::sync::atomic::AtomicU32;
 use core::time::Duration;
 use depthrig_bus::sync::lock;
 use depthrig_bus::{DropCounts, DropReason, HostTime};
@@ -31,6 +32,8 @@ pub(crate) struct Unit {
     pub(crate) world_start: HostTime,
     /// Renders what the cache lacks while the unit streams; without it, before.
     pub(crate) drawing: Option<Arc<Drawing>>,
+    /// Gain of the colour camera.
+    pub(crate) gain: AtomicU32,
     state: Mutex<State>,
 }
 
@@ -109,7 +112,9 @@ impl Unit {
             history: VecDeque::new(),
         };
         let timeline = Timeline::new(&config);
-        Ok(Self { config, model, info, profiles, timeline, world_start, drawing, state: Mutex::new(state) })
+        let gain = AtomicU32::new(config.gain);
+        let state = Mutex::new(state);
+        Ok(Self { config, model, info, profiles, timeline, world_start, drawing, gain, state })
     }
 
     pub(crate) fn state(&self) -> MutexGuard<'_, State> {

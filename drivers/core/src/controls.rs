@@ -1,8 +1,9 @@
 //! A camera's controls by name, and what may be written into them.
 
+use crate::{Error, ErrorKind, Result};
 use core::fmt;
 use core::str::FromStr;
-use depthrig_driver::{Error, ErrorKind, Result};
+use serde::{Deserialize, Serialize};
 
 /// Kind of a control's value (`enum v4l2_ctrl_type`).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -52,8 +53,38 @@ pub struct Control {
     pub items: Vec<(i64, String)>,
 }
 
+/// A control of a running camera.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ControlState {
+    /// Where it is in the camera's table of a rig file: `gain`, or `color_controls.brightness`.
+    pub key: String,
+    /// Its range.
+    pub control: Control,
+    /// Its value; `None` when it cannot be read.
+    pub value: Option<i64>,
+}
+
+/// The controls of a running camera, for use beside its images.
+///
+/// A call may take as long as the kernel's time-out of control transfers (5 s), so none belongs on a capture thread.
+pub trait ControlPanel: Send + Sync {
+    /// All that can be changed while it runs, with their present values.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Disconnected`], [`ErrorKind::Io`].
+    fn list(&self) -> Result<Vec<ControlState>>;
+
+    /// Changes one; `key` as in [`ControlState::key`].
+    ///
+    /// # Errors
+    /// [`ErrorKind::BadInput`] for an unknown key and a value that it does not take, [`ErrorKind::Protocol`] when the camera keeps another
+    /// value, [`ErrorKind::Disconnected`], [`ErrorKind::Io`].
+    fn set(&self, key: &str, value: &ControlValue) -> Result<()>;
+}
+
 /// A value as a rig file gives it.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
 pub enum ControlValue {
     /// A number.
     Integer(i64),
@@ -61,6 +92,21 @@ pub enum ControlValue {
     Boolean(bool),
     /// The item of a menu by its name, or by the name in lower case with `_` between words.
     Item(String),
+}
+
+impl ControlState {
+    /// Its value as a rig file gives it: a menu's by the name of the item.
+    pub fn file_value(&self) -> Option<ControlValue> {
+        let value = self.value?;
+        Some(match self.control.kind {
+            ControlKind::Boolean => ControlValue::Boolean(value != 0),
+            ControlKind::Menu => {
+                let item = self.control.items.iter().find(|(v, _)| *v == value);
+                item.map_or(ControlValue::Integer(value), |(_, name)| ControlValue::Item(name.clone()))
+            }
+            _ => ControlValue::Integer(value),
+        })
+    }
 }
 
 impl fmt::Display for ControlValue {
