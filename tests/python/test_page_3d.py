@@ -1,6 +1,6 @@
 """The 3-D view of the live page in a real browser: points are where the geometry says, in their colours.
 
-Where a point must appear is computed here from the matrix that the page says it used; the scene has nothing of depthrig.
+A point must appear where the matrix that the page says it used puts it; nothing of depthrig is in the scene.
 """
 
 from __future__ import annotations
@@ -172,7 +172,7 @@ def test_the_tint_says_which_camera_a_point_is_from(wall: Wall) -> None:
 
 
 def test_the_points_end_where_the_image_of_the_lens_ends(wall: Wall) -> None:
-    """Colour alone would not show a wrong lens of depth: a point that is misplaced on a plane gets the colour of its place."""
+    """Colour does not show a wrong lens of depth: a point at the wrong place of a plane has the colour of that place."""
     open_view(wall)
     show_only(wall, "side")
     wall.page.select_option("#cloud-paint", "camera")
