@@ -172,7 +172,7 @@ def test_the_tint_says_which_camera_a_point_is_from(wall: Wall) -> None:
 
 
 def test_the_points_end_where_the_image_of_the_lens_ends(wall: Wall) -> None:
-    """Colour does not show a wrong lens of depth: a point at the wrong place of a plane has the colour of that place."""
+    """Colour shows no wrong lens of depth: a point at the wrong place of a plane has the colour of that place."""
     open_view(wall)
     show_only(wall, "side")
     wall.page.select_option("#cloud-paint", "camera")
