@@ -167,6 +167,12 @@ export class CloudView {
     announce("All streams");
   }
 
+  /** Forgets the points: what comes now is of another rig, though its streams may have the same names. */
+  clear() {
+    this.#sources.forEach((source) => source.release(this.#renderer));
+    this.#reset();
+  }
+
   /** @param {boolean} isOpen */
   #setOpen(isOpen) {
     this.isOpen = isOpen;

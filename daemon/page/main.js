@@ -255,6 +255,8 @@ function showDataset(name) {
   hover.hide();
   // The tiles of a dataset have the names of the live ones: no image of one may be taken for the other.
   wall.clear();
+  geometries.clear();
+  cloud.clear();
   recordings.setWatched(name);
   recordBar.setLiveRig(name === null);
   replayBar.show(name !== null, name);
