@@ -259,6 +259,30 @@ def test_a_dataset_is_watched_and_the_live_rig_records_meanwhile(wall: Wall, rig
     wall.wait_for_image(*STREAMS)
 
 
+def test_the_3d_view_goes_from_the_dataset_to_the_live_rig(wall: Wall, rig: Address) -> None:
+    name = record(rig, 2.0)
+    wall.open(f"{rig.origin}/?dataset={name}#token={rig.token}")
+    wall.page.wait_for_selector("#replay", state="visible")
+    wall.wait_for_state("#connection", "live")
+    wall.page.check("#replay-loop")
+    wall.page.locator("#scrub").evaluate(SCRUB, 0)
+    press(wall, "v")
+    wall.wait_for("() => depthrig.view.isOpen && depthrig.view.points > 0")
+    # Before the next message there is no point of the dataset left.
+    left = wall.page.evaluate(
+        """async () => {
+            document.getElementById("back-to-live").click();
+            await new Promise(requestAnimationFrame);
+            return document.querySelectorAll("section.tile").length;
+        }"""
+    )
+    assert left == 0
+    wall.wait_for_state("#connection", "live")
+    wall.wait_for("() => depthrig.view.isOpen && depthrig.view.points > 0")
+    press(wall, "Escape")
+    wall.wait_for_image(*STREAMS)
+
+
 SCRUB = """(scrub, place) => {
     scrub.value = String(place);
     scrub.dispatchEvent(new Event("input", { bubbles: true }));
