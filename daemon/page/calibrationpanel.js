@@ -14,7 +14,6 @@ const AGAIN_MS = 2000;
 const SILENT_MS = 10_000;
 
 export class CalibrationPanel {
-  title = "Calibration";
   element = make("section", "calibration");
   #capture = make("div", "capture");
   #present = make("div", "");

@@ -216,6 +216,14 @@ export class CloudView {
     }
   }
 
+  /** Takes every camera's points away: what comes next are the images of something else. */
+  clear() {
+    this.#sources.forEach((source) => source.release(this.#renderer));
+    this.#sources = [];
+    this.#built = "";
+    this.redraw();
+  }
+
   /** The depth that the range of the colours follows. */
   get sources() {
     return this.isOpen ? this.#sources : [];

@@ -76,7 +76,6 @@ class CameraSection {
 }
 
 export class ControlsPanel {
-  title = "Camera controls";
   element = make("section", "controls");
   #write = makeButton("Write to rig file…", () => void this.#dialog.ask());
   #said = make("p", "said");

@@ -22,7 +22,6 @@ const VERDICT = {
 const GROUP = { error: "Errors", warning: "Warnings", info: "Worth knowing", good: "Good" };
 
 export class DoctorPanel {
-  title = "Doctor";
   element = make("section", "doctor");
   #again = makeButton("Examine again", () => void this.#examine());
   #progress = document.createElement("progress");

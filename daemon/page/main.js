@@ -4,11 +4,8 @@ import { Aids } from "./aids.js";
 import { takeToken } from "./api.js";
 import { Blend } from "./blend.js";
 import { CloudView } from "./cloudview.js";
-import { CalibrationPanel } from "./calibrationpanel.js";
 import { Connection } from "./connection.js";
-import { ControlsPanel } from "./controlspanel.js";
 import { addressOf, datasetOf } from "./dataset.js";
-import { DoctorPanel } from "./doctorpanel.js";
 import { announce, byId, releaseFocusAfterClicks, setState, setText } from "./dom.js";
 import { Hover } from "./hover.js";
 import { actionOf, keyTarget } from "./keys.js";
@@ -18,10 +15,8 @@ import { Panels } from "./panels.js";
 import { PROTOCOL } from "./protocol.js";
 import { DepthRange } from "./range.js";
 import { RecordBar } from "./recordbar.js";
-import { Recordings } from "./recordings.js";
 import { ReplayBar } from "./replaybar.js";
 import { play, setUpSound } from "./sound.js";
-import { SyncPanel } from "./syncpanel.js";
 import { Takes } from "./takes.js";
 import { Wall } from "./wall.js";
 
@@ -96,18 +91,25 @@ Object.assign(debug, { view: cloud.facts, aids });
 const labels = new TileLabels(wall);
 const hover = new Hover(wall.tiles, (id, place) => connection.askPixel(id, place));
 const recordBar = new RecordBar();
-const recordings = new Recordings((name) => watchDataset(name));
-const takes = new Takes(recordBar, (entry) => recordings.marked(entry));
+/** @type {import("./recordings.js").Recordings | null} `null` before its panel is opened first */
+let recordings = null;
+const takes = new Takes(recordBar, (entry) => recordings?.marked(entry));
 const replayBar = new ReplayBar(
   (command, body) => connection.steer(command, body),
   () => watchDataset(null),
 );
 const panels = new Panels({
-  recordings,
-  sync: new SyncPanel(),
-  doctor: new DoctorPanel((report) => recordBar.setDoctor(report)),
-  controls: new ControlsPanel(),
-  calibration: new CalibrationPanel(wall.tiles),
+  recordings: { title: "Recordings", load: loadRecordings },
+  sync: { title: "Synchronisation", load: async () => new (await import("./syncpanel.js")).SyncPanel() },
+  doctor: {
+    title: "Doctor",
+    load: async () => new (await import("./doctorpanel.js")).DoctorPanel((report) => recordBar.setDoctor(report)),
+  },
+  controls: { title: "Camera controls", load: async () => new (await import("./controlspanel.js")).ControlsPanel() },
+  calibration: {
+    title: "Calibration",
+    load: async () => new (await import("./calibrationpanel.js")).CalibrationPanel(wall.tiles),
+  },
 });
 const liveStatus = new LiveStatus(showLiveStatus);
 /** @type {string | null} the dataset that is shown instead of the live rig */
@@ -236,6 +238,13 @@ function showTiles() {
   labels.show(facts, now);
 }
 
+async function loadRecordings() {
+  const { Recordings } = await import("./recordings.js");
+  recordings ??= new Recordings(watchDataset);
+  recordings.setWatched(dataset);
+  return recordings;
+}
+
 /**
  * Shows a dataset on the wall, or the live rig.
  *
@@ -253,11 +262,11 @@ function showDataset(name) {
   dataset = name;
   status = null;
   hover.hide();
-  // The tiles of a dataset have the names of the live ones: no image of one may be taken for the other.
+  // The streams of a dataset have the names of the live ones: no image of one may be taken for the other.
   wall.clear();
-  geometries.clear();
   cloud.clear();
-  recordings.setWatched(name);
+  geometries.clear();
+  recordings?.setWatched(name);
   recordBar.setLiveRig(name === null);
   replayBar.show(name !== null, name);
   connection.open(takeToken(), name);

@@ -1,12 +1,16 @@
-/** The side panel: one panel at a time, opened by a button or a key. */
+/**
+ * The side panel: one panel at a time, opened by a button or a key. The modules of a panel are loaded when it is opened
+ * first: most visits need none of them.
+ */
 
-import { announce, byId, setText } from "./dom.js";
+import { announce, byId, makeText, setText } from "./dom.js";
 
 /** @typedef {"recordings" | "sync" | "doctor" | "controls" | "calibration"} PanelName */
 
+/** @typedef {{title: string, load: () => Promise<Panel>}} PanelPlace */
+
 /**
  * @typedef {Object} Panel
- * @property {string} title
  * @property {HTMLElement} element
  * @property {() => void} open it is shown now
  * @property {() => void} close
@@ -20,13 +24,17 @@ export class Panels {
   #buttons = [...document.querySelectorAll("#panel-buttons button")].filter((b) => b instanceof HTMLButtonElement);
   /** @type {PanelName | null} */
   #shown = null;
+  /** @type {Map<PanelName, Promise<Panel>>} one of each: a panel that is asked for twice is made once */
+  #loads = new Map();
+  /** @type {Map<PanelName, Panel>} */
+  #loaded = new Map();
   /** @type {Element | null} what had the focus before */
   #focused = null;
-  #panels;
+  #places;
 
-  /** @param {Record<PanelName, Panel>} panels */
-  constructor(panels) {
-    this.#panels = panels;
+  /** @param {Record<PanelName, PanelPlace>} places */
+  constructor(places) {
+    this.#places = places;
     byId("panel-close", HTMLButtonElement).addEventListener("click", () => this.close());
     for (const button of this.#buttons) {
       button.addEventListener("click", () => this.toggle(/** @type {PanelName} */ (button.dataset.panel)));
@@ -43,27 +51,48 @@ export class Panels {
       this.close();
       return;
     }
-    const before = this.#shown;
-    if (before === null) {
+    if (this.#shown === null) {
       this.#focused = document.activeElement;
     } else {
-      this.#panels[before].close();
+      this.#loaded.get(this.#shown)?.close();
     }
     this.#shown = name;
-    const panel = this.#panels[name];
-    setText(this.#title, panel.title);
-    this.#body.replaceChildren(panel.element);
+    setText(this.#title, this.#places[name].title);
+    this.#body.replaceChildren();
     this.#show();
-    panel.open();
-    this.#body.scrollTop = 0;
     this.#title.focus();
+    void this.#fill(name);
+  }
+
+  /** @param {PanelName} name */
+  async #fill(name) {
+    const load = this.#loads.get(name) ?? this.#places[name].load();
+    this.#loads.set(name, load);
+    /** @type {Panel} */
+    let panel;
+    try {
+      panel = await load;
+    } catch {
+      this.#loads.delete(name);
+      if (this.#shown === name) {
+        const text = "This panel was not loaded: the daemon does not answer. Reload the page when it does.";
+        this.#body.replaceChildren(makeText("p", "said", text));
+      }
+      return;
+    }
+    this.#loaded.set(name, panel);
+    if (this.#shown === name && panel.element.parentElement !== this.#body) {
+      this.#body.replaceChildren(panel.element);
+      panel.open();
+      this.#body.scrollTop = 0;
+    }
   }
 
   close() {
     if (this.#shown === null) {
       return;
     }
-    this.#panels[this.#shown].close();
+    this.#loaded.get(this.#shown)?.close();
     this.#shown = null;
     this.#body.replaceChildren();
     this.#show();
@@ -76,7 +105,7 @@ export class Panels {
   /** @param {import("./types.js").Status} status */
   update(status) {
     if (this.#shown !== null) {
-      this.#panels[this.#shown].update?.(status);
+      this.#loaded.get(this.#shown)?.update?.(status);
     }
   }
 

@@ -21,7 +21,6 @@ function isReportDue({ has_report, health, started_utc_ns, duration_ns }) {
 }
 
 export class Recordings {
-  title = "Recordings";
   element = make("section", "recordings");
   #said = make("p", "said");
   #undo = makeButton("Undo", () => this.#undoing?.());

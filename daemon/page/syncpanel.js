@@ -10,7 +10,6 @@ import { pairSkews, signedMs, streamOfEach, streamSkews } from "./skew.js";
 const STATE_TEXT = { good: "good", wide: "wide", out: "outside", none: "no set" };
 
 export class SyncPanel {
-  title = "Synchronisation";
   element = make("section", "sync");
   #summary = make("p", "");
   #streams = make("tbody", "");

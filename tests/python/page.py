@@ -264,7 +264,7 @@ PLACE = """([stream, x, y]) => {
 
 
 PAGE_FILES = re.compile(r"^http://[^/]+/[\w.-]*(\?[^/]*)?$")
-PAGE_TYPES = {".html": "text/html; charset=utf-8", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
+PAGE_TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 
 
 def serve_from(context: BrowserContext, folder: Path) -> None:
