@@ -1,6 +1,7 @@
 #!/bin/bash
 # Inside a clean Debian, as root: the wheel before the Debian package, because the second brings libusb to the system.
-set -euo pipefail
+set -Eeuo pipefail
+trap 'echo "failed: $BASH_COMMAND" >&2' ERR
 . /etc/os-release
 echo "$PRETTY_NAME, $(ldd --version | sed -n '1s/.* //p'), Python $(python3 -c 'import platform; print(platform.python_version())')"
 useradd --create-home robot
