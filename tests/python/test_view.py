@@ -108,7 +108,7 @@ def test_what_rerun_gets_is_what_the_cameras_were_given(runtime: Path, rig: Path
     check(out)
     found = components(out)
     assert found.keys() >= {f"/seen/{c}/{s}" for c in ("still", "turned", "front") for s in ("color", "depth")}
-    times = [t.as_py() for t in found["/seen/front/depth"]["capture"]]
+    times = [t.value for t in found["/seen/front/depth"]["capture"]]
     assert times == sorted(set(times))
     # 20 are due; a busy computer may do less, never more.
     assert 4 <= len(times) <= 22, len(times)
