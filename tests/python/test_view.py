@@ -48,7 +48,12 @@ def rig(binary: str, runtime: Path, tmp_path_factory: pytest.TempPathFactory) ->
 def view(runtime: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     env = {**environment(runtime), "PYTHONPATH": str(ROOT / "python" / "src")}
     return subprocess.run(
-        [sys.executable, "-m", "depthrig.view", *arguments], env=env, capture_output=True, text=True, timeout=WAIT_S, check=False
+        [sys.executable, "-m", "depthrig.view", *arguments],
+        env=env,
+        capture_output=True,
+        text=True,
+        timeout=WAIT_S,
+        check=False,
     )
 
 
