@@ -23,7 +23,7 @@ const CLEAR: &str = "\x1b[2J";
 const CLEAR_LINE: &str = "\x1b[K";
 const CLEAR_BELOW: &str = "\x1b[J";
 
-/// What a terminal that is taken has to be given back: the settings of its keyboard, and the messages of panics, which
+/// State to give back with a terminal that is taken: the settings of its keyboard, and the messages of panics, which
 /// would be lost with the page.
 static TAKEN: Mutex<Option<Taken>> = Mutex::new(None);
 
@@ -189,11 +189,9 @@ pub fn restore() {
 /// Keeps the messages of panics until the terminal is given back; printed on the page they would vanish with it.
 fn keep_panics() {
     let before = std::panic::take_hook();
-    std::panic::set_hook(Box::new(move |panic| {
-        match TAKEN.try_lock().ok().as_deref_mut() {
-            Some(Some(taken)) => taken.panics.push(panic.to_string()),
-            _ => before(panic),
-        }
+    std::panic::set_hook(Box::new(move |panic| match TAKEN.try_lock().ok().as_deref_mut() {
+        Some(Some(taken)) => taken.panics.push(panic.to_string()),
+        _ => before(panic),
     }));
 }
 

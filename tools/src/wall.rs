@@ -105,7 +105,7 @@ impl Wall {
         out
     }
 
-    /// What is left to say below the images.
+    /// A note for below the images: how they are shown, and how many streams are not.
     pub fn note(&self) -> String {
         let shown = self.drawn.map_or(0, |grid| grid.shown);
         let hidden = self.tiles.len().saturating_sub(shown);
@@ -130,7 +130,8 @@ fn fitted(image: RgbImage, width: u32, height: u32) -> RgbImage {
     if image.width() <= width && image.height() <= height {
         return image;
     }
-    let scale = (f64::from(width) / f64::from(image.width())).min(f64::from(height) / f64::from(image.height()));
+    let scale =
+        (f64::from(width) / f64::from(image.width())).min(f64::from(height) / f64::from(image.height()));
     let side = |n: u32| ((f64::from(n) * scale) as u32).max(1);
     image::imageops::thumbnail(&image, side(image.width()), side(image.height()))
 }

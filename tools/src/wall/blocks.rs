@@ -44,7 +44,8 @@ mod tests {
         picked.put_pixel(0, 0, Rgb([1, 2, 3]));
         picked.put_pixel(1, 0, Rgb([1, 2, 3]));
         let text = image(&picked, Place { row: 5, column: 7 });
-        let expected = "\x1b[5;7H\x1b[38;2;1;2;3m\x1b[48;2;0;0;0m▀▀\x1b[0m\x1b[6;7H\x1b[38;2;0;0;0m\x1b[49m▀▀\x1b[0m";
+        let expected =
+            "\x1b[5;7H\x1b[38;2;1;2;3m\x1b[48;2;0;0;0m▀▀\x1b[0m\x1b[6;7H\x1b[38;2;0;0;0m\x1b[49m▀▀\x1b[0m";
         assert_eq!(text, expected);
     }
 }

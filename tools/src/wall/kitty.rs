@@ -44,9 +44,12 @@ mod tests {
 
     #[test]
     fn parts_are_short_and_together_they_are_the_png() {
-        let noise = RgbImage::from_fn(100, 80, |x, y| image::Rgb([(x * y) as u8, (x * 7 + y * y) as u8, (x ^ y) as u8]));
+        let noise = RgbImage::from_fn(100, 80, |x, y| {
+            image::Rgb([(x * y) as u8, (x * 7 + y * y) as u8, (x ^ y) as u8])
+        });
         let text = super::image(&noise, 4);
-        let parts: Vec<&str> = text.split_terminator("\x1b\\").map(|p| p.strip_prefix("\x1b_G").unwrap()).collect();
+        let parts: Vec<&str> =
+            text.split_terminator("\x1b\\").map(|p| p.strip_prefix("\x1b_G").unwrap()).collect();
         assert!(parts.len() > 1 && parts.iter().all(|p| p.len() < PART + 64));
         assert!(parts[0].starts_with("a=T,f=100,i=5,p=1,C=1,q=2,m=1;"));
         assert!(parts.last().unwrap().starts_with("m=0;"));
