@@ -167,12 +167,6 @@ export class CloudView {
     announce("All streams");
   }
 
-  /** Forgets the points: what comes now is of another rig, though its streams may have the same names. */
-  clear() {
-    this.#sources.forEach((source) => source.release(this.#renderer));
-    this.#reset();
-  }
-
   /** @param {boolean} isOpen */
   #setOpen(isOpen) {
     this.isOpen = isOpen;
@@ -221,7 +215,7 @@ export class CloudView {
     this.#sources.forEach((source) => source.release(this.#renderer));
     this.#sources = [];
     this.#built = "";
-    this.redraw();
+    this.#reset();
   }
 
   /** The depth that the range of the colours follows. */
