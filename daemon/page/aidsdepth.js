@@ -74,6 +74,8 @@ export class DepthAids {
     this.holes = null;
     setText(this.#filled, "Filled: measuring");
     setState(this.#filled, "none");
+    setText(this.#planeText, "");
+    this.#say();
   }
 
   /** @param {number | null} holes share of the full image */

@@ -53,6 +53,12 @@ export class CloudInput {
   constructor(element, options) {
     this.#element = element;
     this.#options = options;
+  }
+
+  /** Listens from now on. */
+  listen() {
+    const element = this.#element;
+    const options = this.#options;
     element.addEventListener("pointerdown", (event) => {
       element.setPointerCapture(event.pointerId);
       this.#pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });

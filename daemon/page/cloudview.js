@@ -93,7 +93,7 @@ export class CloudView {
   constructor(options) {
     this.#options = options;
     this.#geometries = options.geometries;
-    new CloudInput(this.#canvas, {
+    const input = new CloudInput(this.#canvas, {
       orbit: () => this.#orbit,
       move: (orbit) => {
         this.#orbit = orbit;
@@ -106,6 +106,7 @@ export class CloudView {
         this.redraw();
       },
     });
+    input.listen();
     this.#bar = new CloudBar({
       onPaint: () => this.redraw(),
       onChosen: (source) => {
@@ -214,7 +215,7 @@ export class CloudView {
     this.#sources.forEach((source) => source.release(this.#renderer));
     this.#sources = [];
     this.#built = "";
-    this.redraw();
+    this.#reset();
   }
 
   /** The depth that the range of the colours follows. */

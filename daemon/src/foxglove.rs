@@ -18,7 +18,7 @@ use depthrig_bus::{HostTime, RigName, RuntimeDir};
 use depthrig_recorder::LiveSource;
 use hyper::body::Bytes;
 use mailbox::Mailbox;
-pub(crate) use mailbox::Next;
+pub(crate) use mailbox::{Content, Next};
 pub(crate) use protocol::{FromClient, SUBPROTOCOLS, ServiceCall, Subscription, ToClient};
 pub(crate) use scene::Scene;
 pub(crate) use services::{SERVICE_ENCODINGS, advertise as advertise_services, call as call_service};
@@ -133,11 +133,11 @@ impl Foxglove {
             Ok(scene) => state.scene = Some(Arc::new(scene)),
             Err(e) => tracing::warn!(error = %e, "live viewers do not see the streams of the rig"),
         }
-        // What sits where is sent again to those who have seen it otherwise.
         let scene = state.scene.clone();
         if let Some(scene) = &scene {
+            // Those who have seen the old poses get the new ones.
             for client in state.clients.values_mut() {
-                client.put_latched(scene);
+                client.put_poses(scene);
             }
         }
         drop(state);
@@ -147,8 +147,8 @@ impl Foxglove {
 }
 
 impl Client {
-    /// Puts the latched channels that are watched into the mailbox.
-    fn put_latched(&mut self, scene: &Scene) {
+    /// Puts the poses on the mount into the mailbox if they are watched.
+    fn put_poses(&mut self, scene: &Scene) {
         for (channel, watched) in &self.watched {
             if scene.source(*channel) == Some(LiveSource::TfStatic) {
                 let message = scene.tf_static(watched.subscription);
@@ -165,7 +165,7 @@ impl Place {
         self.wake.notified().await;
     }
 
-    /// What is sent next.
+    /// The next thing to send.
     pub(crate) fn next(&self) -> Option<Next> {
         let mut state = lock(&self.foxglove.shared.state);
         let next = state.clients.get_mut(&self.number)?.mailbox.next();
@@ -176,9 +176,13 @@ impl Place {
         next
     }
 
-    /// The client has drawn all images up to this one.
-    pub(crate) fn drawn(&self, number: u64) {
-        self.change(|client, _| client.mailbox.drawn(number));
+    /// The client has answered a ping.
+    pub(crate) fn answered(&self, number: u64) {
+        self.change(|client, _| {
+            client.mailbox.answered(number);
+            // Small messages may have waited for this.
+            client.wake.notify_one();
+        });
     }
 
     /// Subscribes; lines about what cannot be subscribed to go to the client.
@@ -187,9 +191,11 @@ impl Place {
     /// `Other` when the thread cannot be started.
     pub(crate) fn subscribe(&self, subscriptions: &[Subscription]) -> Result<()> {
         self.change(|client, scene| {
+            let Some(scene) = scene else { return };
+            let mut wants_poses = false;
             for Subscription { id, channel_id } in subscriptions {
-                let known = scene.is_some_and(|scene| scene.source(*channel_id).is_some());
-                if !known {
+                let source = scene.source(*channel_id);
+                if source.is_none() {
                     client.put_problem(format!("channel {channel_id} does not exist"));
                 } else if client.watched.contains_key(channel_id) {
                     client.put_problem(format!("there is a subscription to channel {channel_id} already"));
@@ -198,10 +204,11 @@ impl Place {
                 } else {
                     let watched = Watched { subscription: *id, due: HostTime::now(), sent: None };
                     client.watched.insert(*channel_id, watched);
+                    wants_poses |= source == Some(LiveSource::TfStatic);
                 }
             }
-            if let Some(scene) = scene {
-                client.put_latched(scene);
+            if wants_poses {
+                client.put_poses(scene);
             }
         });
         self.start()

@@ -31,7 +31,7 @@ pub enum LiveSource {
     Diagnostics,
 }
 
-/// A channel as a viewer is told of it.
+/// A channel as it is announced to a viewer.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LiveChannel {
     /// Its content.

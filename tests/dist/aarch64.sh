@@ -2,7 +2,8 @@
 # Runs the binary for aarch64 in QEMU (user mode) beside that of this computer, and compares what they compute.
 #
 #   tests/dist/aarch64.sh ROOT WHEEL DEB     ROOT: a Debian for arm64, unpacked, with libc6 and libusb
-set -euo pipefail
+set -Eeuo pipefail
+trap 'echo "failed: $BASH_COMMAND" >&2' ERR
 cd "$(dirname "$0")/../.."
 root=$1 wheel=$2 deb=$3
 here=target/dist/out/x86_64/depthrig
@@ -17,18 +18,16 @@ packaged=$work/deb/usr/bin/depthrig
 cmp "$packaged" "$work"/wheel/depthrig-*.data/scripts/depthrig
 arm() { qemu-aarch64 -L "$root" "$packaged" "$@"; }
 
-file() { readelf --file-header "$1" | sed -n 's/ *Machine: *//p'; }
-[ "$(file "$packaged")" = AArch64 ]
+readelf --file-header "$packaged" | grep --quiet 'Machine: *AArch64'
 # The wheel's own libusb, not that of the system.
 mkdir -p "$work/bare/bin" "$work/bare/lib/depthrig"
 cp "$packaged" "$work/bare/bin/"
 cp "$work"/wheel/depthrig-*.data/data/lib/depthrig/libusb-1.0.so.0 "$work/bare/lib/depthrig/"
-qemu-aarch64 -L "$root" -E LD_TRACE_LOADED_OBJECTS=1 "$work/bare/bin/depthrig" | grep -F "$work/bare/lib/depthrig/libusb"
-chmod +x "$work/bare/bin/depthrig"
+qemu-aarch64 -L "$root" -E LD_TRACE_LOADED_OBJECTS=1 "$work/bare/bin/depthrig" | grep --fixed-strings /lib/depthrig/libusb
 [ "$(arm --version)" = "$("$here" --version)" ]
 echo "version: $(arm --version)"
 
-. tests/dist/rig.sh
+. tests/dist/rig.sh # rig_file
 rig_file >"$work/rig.toml"
 arm config check "$work/rig.toml"
 diff <(arm config show) <("$here" config show)

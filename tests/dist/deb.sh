@@ -1,6 +1,7 @@
 #!/bin/bash
 # As an ordinary user of a clean system: the Debian package.
-set -euo pipefail
+set -Eeuo pipefail
+trap 'echo "failed: $BASH_COMMAND" >&2' ERR
 cd
 program=/usr/bin/depthrig
 . /test/use.sh

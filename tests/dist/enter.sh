@@ -11,7 +11,9 @@ for device in null zero full random urandom tty; do
     touch "$system/dev/$device"
     mount --bind "/dev/$device" "$system/dev/$device"
 done
-mkdir "$system/dev/shm"
+mkdir "$system/dev/shm" "$system/dev/pts"
+mount -t devpts -o newinstance,ptmxmode=0666 devpts "$system/dev/pts"
+ln -s pts/ptmx "$system/dev/ptmx"
 mount -t tmpfs -o mode=1777,size=1g tmpfs "$system/dev/shm"
 mkdir "$system/packages" "$system/wheels" "$system/test"
 cp "$WHEEL" "$DEB" "$system/packages/"

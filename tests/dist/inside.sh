@@ -1,10 +1,11 @@
 #!/bin/bash
 # Inside a clean Debian, as root: the wheel before the Debian package, because the second brings libusb to the system.
-set -euo pipefail
+set -Eeuo pipefail
+trap 'echo "failed: $BASH_COMMAND" >&2' ERR
 . /etc/os-release
 echo "$PRETTY_NAME, $(ldd --version | sed -n '1s/.* //p'), Python $(python3 -c 'import platform; print(platform.python_version())')"
 useradd --create-home robot
-robot() { runuser --user robot -- env -i HOME=/home/robot PATH=/usr/bin:/bin LANG=C.UTF-8 "$@"; }
+robot() { runuser --user robot -- env -i HOME=/home/robot USER=robot PATH=/usr/bin:/bin LANG=C.UTF-8 "$@"; }
 
 if ldconfig -p | grep -q libusb-1.0; then
     echo "this system has libusb already; the wheel must bring it" >&2

@@ -1,6 +1,7 @@
 #!/bin/bash
 # As an ordinary user of a clean system without libusb: the wheel brings the binary and the Python package.
-set -euo pipefail
+set -Eeuo pipefail
+trap 'echo "failed: $BASH_COMMAND" >&2' ERR
 cd
 python3 -m venv environment
 environment/bin/pip install --quiet --disable-pip-version-check --no-index --find-links /wheels /packages/*.whl

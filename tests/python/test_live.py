@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import http.client
 import io
 import json
@@ -402,6 +403,14 @@ def test_the_page_is_served_with_its_policy(rig: Rig) -> None:
     assert answer.headers["x-content-type-options"] == "nosniff"
     assert b"token" not in answer.headers.as_bytes() and rig.token.encode() not in answer.read()
     assert rig.get("/", **{"If-None-Match": answer.headers["etag"]}).status == 304
+    # A browser gets a quarter of the bytes.
+    plain = rig.get("/main.js")
+    packed = rig.get("/main.js", **{"Accept-Encoding": "gzip, br"})
+    assert (plain.headers["content-encoding"], packed.headers["content-encoding"]) == (None, "gzip")
+    assert packed.headers["vary"] == "Accept-Encoding"
+    small = packed.read()
+    text = plain.read()
+    assert gzip.decompress(small) == text and len(small) < len(text) / 2
     assert rig.get("/../Cargo.toml").status in (401, 404)
 
 

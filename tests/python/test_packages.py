@@ -126,9 +126,8 @@ def test_systemd_finds_nothing_wrong_with_the_users_service(tree: Path, tmp_path
     checked = tmp_path / "depthrig.service"
     checked.write_text(unit.replace("/usr/bin/depthrig", "/bin/true"))
     asked = [analyze, "--user", "--man=no", "verify", str(checked)]
-    said = subprocess.run(
-        asked, capture_output=True, text=True, check=False, timeout=60, env={**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
-    )
+    env = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
+    said = subprocess.run(asked, capture_output=True, text=True, check=False, timeout=60, env=env)
     ours = [line for line in (said.stdout + said.stderr).splitlines() if "depthrig.service" in line]
     assert ours == [], ours
 

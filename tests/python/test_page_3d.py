@@ -1,6 +1,6 @@
 """The 3-D view of the live page in a real browser: points are where the geometry says, in their colours.
 
-Where a point must appear is computed here from the matrix that the page says it used; the scene has nothing of depthrig.
+A point must appear where the matrix that the page says it used puts it; nothing of depthrig is in the scene.
 """
 
 from __future__ import annotations
@@ -114,8 +114,8 @@ def on_plane(dx: float, dy: float) -> tuple[float, float, float]:
 
 
 def square_and_surroundings() -> dict[tuple[float, float, float], tuple[int, int, int]]:
-    inner = HALF_M - 0.035
-    outer = HALF_M + 0.035
+    inner = HALF_M - 0.025
+    outer = HALF_M + 0.025
     corners = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)]
     expected = {on_plane(a * inner, b * inner): RED for a, b in corners}
     return expected | {on_plane(a * outer, b * outer): BLUE for a, b in corners if (a, b) != (0, 0)}
@@ -169,6 +169,24 @@ def test_the_tint_says_which_camera_a_point_is_from(wall: Wall) -> None:
 
     until(lambda: wrong() == [], wrong)
     save_screenshot(wall, "cloud-tint")
+
+
+def test_the_points_end_where_the_image_of_the_lens_ends(wall: Wall) -> None:
+    """Colour shows no wrong lens of depth: a point at the wrong place of a plane has the colour of that place."""
+    open_view(wall)
+    show_only(wall, "side")
+    wall.page.select_option("#cloud-paint", "camera")
+    _, seen = SIDE.seen(SIDE.depth)
+    inside, outside = [], []
+    for edge, inner in ((seen[120, 0], seen[120, 10]), (seen[0, 160], seen[10, 160]), (seen[239, 160], seen[229, 160])):
+        outwards = (edge - inner) / np.linalg.norm(edge - inner)
+        inside.append(tuple(edge - 0.02 * outwards))
+        outside.append(tuple(edge + 0.02 * outwards))
+
+    def levels() -> list[int]:
+        return [max(color) for color in pixels(wall, *inside, *outside)]
+
+    until(lambda: min(levels()[:3]) > 90 > max(levels()[3:]), levels)
 
 
 def test_a_camera_that_is_not_chosen_is_neither_shown_nor_watched(wall: Wall) -> None:

@@ -48,7 +48,12 @@ def rig(binary: str, runtime: Path, tmp_path_factory: pytest.TempPathFactory) ->
 def view(runtime: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     env = {**environment(runtime), "PYTHONPATH": str(ROOT / "python" / "src")}
     return subprocess.run(
-        [sys.executable, "-m", "depthrig.view", *arguments], env=env, capture_output=True, text=True, timeout=WAIT_S, check=False
+        [sys.executable, "-m", "depthrig.view", *arguments],
+        env=env,
+        capture_output=True,
+        text=True,
+        timeout=WAIT_S,
+        check=False,
     )
 
 
@@ -108,7 +113,7 @@ def test_what_rerun_gets_is_what_the_cameras_were_given(runtime: Path, rig: Path
     check(out)
     found = components(out)
     assert found.keys() >= {f"/seen/{c}/{s}" for c in ("still", "turned", "front") for s in ("color", "depth")}
-    times = [t.as_py() for t in found["/seen/front/depth"]["capture"]]
+    times = [t.value for t in found["/seen/front/depth"]["capture"]]
     assert times == sorted(set(times))
     # 20 are due; a busy computer may do less, never more.
     assert 4 <= len(times) <= 22, len(times)

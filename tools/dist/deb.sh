@@ -1,9 +1,10 @@
 #!/usr/bin/env bash
 # Builds the Debian package around a built binary: the same bytes each time for one commit.
 #
-#   tools/dist/deb.sh ARCH BINARY GENERATOR OUT    x86_64 or aarch64; GENERATOR is a binary of the same version that runs on
-#                                                  this computer, and writes manual pages and completions
+#   tools/dist/deb.sh ARCH BINARY GENERATOR OUT    x86_64 or aarch64
 #   tools/dist/deb.sh --tree BINARY GENERATOR OUT  only the files of the package, as a tree below OUT
+#
+# GENERATOR is a binary of the same version that runs on this computer: it writes manual pages and completions.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 arch=$1 binary=$2 generator=$(realpath "$3") out=$4

@@ -26,6 +26,7 @@ def put_libusb(tree: Path, libusb: Path) -> None:
     folder.mkdir(parents=True)
     shutil.copy(libusb / LIBUSB, folder / LIBUSB)
     licenses = next(tree.glob("*.dist-info")) / "licenses"
+    licenses.mkdir(exist_ok=True)
     shutil.copy(libusb / "COPYING", licenses / "COPYING.libusb")
 
 

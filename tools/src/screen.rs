@@ -23,7 +23,7 @@ const CLEAR: &str = "\x1b[2J";
 const CLEAR_LINE: &str = "\x1b[K";
 const CLEAR_BELOW: &str = "\x1b[J";
 
-/// What a terminal that is taken has to be given back: the settings of its keyboard, and the messages of panics, which
+/// State to give back with a terminal that is taken: the settings of its keyboard, and the messages of panics, which
 /// would be lost with the page.
 static TAKEN: Mutex<Option<Taken>> = Mutex::new(None);
 

@@ -105,7 +105,7 @@ impl Wall {
         out
     }
 
-    /// What is left to say below the images.
+    /// A note for below the images: how they are shown, and how many streams are not.
     pub fn note(&self) -> String {
         let shown = self.drawn.map_or(0, |grid| grid.shown);
         let hidden = self.tiles.len().saturating_sub(shown);

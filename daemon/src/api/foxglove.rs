@@ -10,8 +10,8 @@ use super::reply::Refusal;
 use super::token::Token;
 use crate::control::Control;
 use crate::foxglove::{
-    Foxglove, FromClient, Next, Place, SERVICE_ENCODINGS, SUBPROTOCOLS, Scene, ServiceCall, ToClient,
-    advertise_services, call_service,
+    Content, Foxglove, FromClient, Next, Place, SERVICE_ENCODINGS, SUBPROTOCOLS, Scene, ServiceCall,
+    ToClient, advertise_services, call_service,
 };
 use axum::Router;
 use axum::body::Bytes;
@@ -177,7 +177,7 @@ impl Client {
                         },
                         Some(Ok(Message::Pong(payload))) => {
                             if let Ok(number) = <[u8; 8]>::try_from(&payload[..]) {
-                                self.place.drawn(u64::from_le_bytes(number));
+                                self.place.answered(u64::from_le_bytes(number));
                             }
                             Ok(())
                         }
@@ -233,22 +233,18 @@ impl Client {
         Ok(())
     }
 
-    /// Sends one thing of what waits.
+    /// Sends one thing of what waits, and the ping that the client answers when it has read it.
     async fn send_next(&self, socket: &mut WebSocket) -> Result<(), axum::Error> {
-        match self.place.next() {
-            Some(Next::Small(messages)) => {
+        let Some(Next { number, content }) = self.place.next() else { return Ok(()) };
+        match content {
+            Content::Messages(messages) => {
                 for message in messages {
                     socket.send(Message::Binary(message)).await?;
                 }
-                Ok(())
             }
-            Some(Next::Image { number, bytes }) => {
-                socket.send(Message::Binary(bytes)).await?;
-                socket.send(Message::Ping(number.to_le_bytes().to_vec().into())).await
-            }
-            Some(Next::Problem(message)) => send(socket, &ToClient::Status { level: 1, message }).await,
-            None => Ok(()),
+            Content::Problem(message) => send(socket, &ToClient::Status { level: 1, message }).await?,
         }
+        socket.send(Message::Ping(number.to_le_bytes().to_vec().into())).await
     }
 
     /// Does what the client asks for.

@@ -1,8 +1,8 @@
-//! Messages that wait for one client: of each channel the newest, and images only as many as the client draws.
+//! Messages that wait for one client: of each channel the newest, and no more than the client takes in.
 //!
-//! An image is on its way from the moment in which it is encoded until the client has answered the ping that follows it. At the most [`IMAGES`] are, one of a
-//! channel, and no more than [`IMAGE_BYTES`] together. So a client that does not read costs this much and no more, and when it comes back it has this
-//! many old images to read.
+//! A ping follows each thing that is sent. Until the client has answered it, the thing is on its way: at the most [`IMAGES`] images, one of a channel, no more
+//! than [`IMAGE_BYTES`] together; and [`BUNDLES`] bundles of small messages. So a client that does not read costs this much and no more, and when it
+//! comes back it has this many old messages to read.
 
 use hyper::body::Bytes;
 use std::collections::{BTreeMap, VecDeque};
@@ -11,6 +11,8 @@ use std::collections::{BTreeMap, VecDeque};
 pub(super) const IMAGES: usize = 4;
 /// Their bytes; a single image may have more.
 pub(super) const IMAGE_BYTES: usize = 8 << 20;
+/// Bundles of small messages that may be on their way; a browser may take 0.1 s to answer, and batches of an IMU come more often.
+const BUNDLES: usize = 16;
 /// Lines about problems that may wait.
 const PROBLEMS: usize = 8;
 
@@ -19,41 +21,45 @@ const PROBLEMS: usize = 8;
 pub(super) struct Mailbox {
     /// Of each small channel: the newest message, or the newest batch of an IMU.
     small: BTreeMap<u32, Vec<Bytes>>,
+    /// Numbers of the bundles that the client has not answered.
+    bundles: Vec<u64>,
     /// Images that wait for the connection, oldest first.
-    images: VecDeque<Image>,
-    /// Images that the client has not drawn yet, those that wait included.
-    on_the_way: Vec<OnTheWay>,
-    /// Number of the newest image.
+    waiting: VecDeque<Waiting>,
+    /// Images that the client has not answered, those that wait included.
+    images: Vec<OnTheWay>,
+    /// Number of the newest ping.
     newest: u64,
     problems: VecDeque<String>,
 }
 
 #[derive(Debug)]
-struct Image {
-    number: u64,
+struct Waiting {
     channel: u32,
     bytes: Bytes,
 }
 
 #[derive(Debug)]
 struct OnTheWay {
-    number: u64,
     channel: u32,
     bytes: usize,
+    /// Number of the ping behind it; `None` while it waits.
+    sent: Option<u64>,
 }
 
-/// What is sent next.
+/// The next thing to send; a ping with its number follows.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) enum Next {
-    /// Small messages.
-    Small(Vec<Bytes>),
-    /// An image; a ping with this number follows it.
-    Image {
-        /// The number.
-        number: u64,
-        /// The message.
-        bytes: Bytes,
-    },
+pub(crate) struct Next {
+    /// The number.
+    pub number: u64,
+    /// The thing.
+    pub content: Content,
+}
+
+/// A thing to send.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) enum Content {
+    /// Messages of channels.
+    Messages(Vec<Bytes>),
     /// Why something is not shown.
     Problem(String),
 }
@@ -66,19 +72,17 @@ impl Mailbox {
 
     /// Whether an image of `bytes` may be sent on this channel.
     pub(super) fn takes_image(&self, channel: u32, bytes: usize) -> bool {
-        let waiting: usize = self.on_the_way.iter().map(|i| i.bytes).sum();
-        self.on_the_way.is_empty()
-            || (self.on_the_way.len() < IMAGES
-                && waiting.saturating_add(bytes) <= IMAGE_BYTES
-                && self.on_the_way.iter().all(|i| i.channel != channel))
+        let on_the_way: usize = self.images.iter().map(|i| i.bytes).sum();
+        self.images.is_empty()
+            || (self.images.len() < IMAGES
+                && on_the_way.saturating_add(bytes) <= IMAGE_BYTES
+                && self.images.iter().all(|i| i.channel != channel))
     }
 
     /// Puts in an image.
     pub(super) fn put_image(&mut self, channel: u32, bytes: Bytes) {
-        self.newest += 1;
-        let number = self.newest;
-        self.on_the_way.push(OnTheWay { number, channel, bytes: bytes.len() });
-        self.images.push_back(Image { number, channel, bytes });
+        self.images.push(OnTheWay { channel, bytes: bytes.len(), sent: None });
+        self.waiting.push_back(Waiting { channel, bytes });
     }
 
     /// Puts in a line for the client; the same line waits once.
@@ -88,34 +92,36 @@ impl Mailbox {
         }
     }
 
-    /// The client has drawn all images up to this one.
-    pub(super) fn drawn(&mut self, number: u64) {
-        let is_unsent = |i: &OnTheWay| self.images.front().is_some_and(|first| i.number >= first.number);
-        self.on_the_way.retain(|i| i.number > number || is_unsent(i));
+    /// The client has answered this ping, so it has read everything before.
+    pub(super) fn answered(&mut self, number: u64) {
+        self.images.retain(|i| i.sent.is_none_or(|sent| sent > number));
+        self.bundles.retain(|sent| *sent > number);
     }
 
     /// Forgets what waits on a channel.
     pub(super) fn forget(&mut self, channel: u32) {
         self.small.remove(&channel);
-        self.images.retain(|image| {
-            let stays = image.channel != channel;
-            if !stays {
-                self.on_the_way.retain(|i| i.number != image.number);
-            }
-            stays
-        });
+        self.waiting.retain(|image| image.channel != channel);
+        self.images.retain(|i| i.channel != channel || i.sent.is_some());
     }
 
-    /// What is sent next: small messages go before images.
+    /// The next thing to send: small messages go before images.
     pub(super) fn next(&mut self) -> Option<Next> {
-        if let Some(problem) = self.problems.pop_front() {
-            return Some(Next::Problem(problem));
-        }
-        if !self.small.is_empty() {
-            let all = core::mem::take(&mut self.small);
-            return Some(Next::Small(all.into_values().flatten().collect()));
-        }
-        self.images.pop_front().map(|image| Next::Image { number: image.number, bytes: image.bytes })
+        let number = self.newest + 1;
+        let content = if let Some(problem) = self.problems.pop_front() {
+            Content::Problem(problem)
+        } else if !self.small.is_empty() && self.bundles.len() < BUNDLES {
+            self.bundles.push(number);
+            Content::Messages(core::mem::take(&mut self.small).into_values().flatten().collect())
+        } else {
+            let image = self.waiting.pop_front()?;
+            if let Some(i) = self.images.iter_mut().find(|i| i.channel == image.channel && i.sent.is_none()) {
+                i.sent = Some(number);
+            }
+            Content::Messages(vec![image.bytes])
+        };
+        self.newest = number;
+        Some(Next { number, content })
     }
 }
 
@@ -127,14 +133,18 @@ mod tests {
         vec![n as u8; n].into()
     }
 
+    fn messages(number: u64, of: &[usize]) -> Option<Next> {
+        Some(Next { number, content: Content::Messages(of.iter().map(|n| bytes(*n)).collect()) })
+    }
+
     #[test]
     fn the_newest_small_message_wins_and_goes_before_images() {
         let mut mailbox = Mailbox::default();
         mailbox.put_image(1, bytes(9));
         mailbox.put_small(2, vec![bytes(1)]);
         mailbox.put_small(2, vec![bytes(2), bytes(3)]);
-        assert_eq!(mailbox.next(), Some(Next::Small(vec![bytes(2), bytes(3)])));
-        assert_eq!(mailbox.next(), Some(Next::Image { number: 1, bytes: bytes(9) }));
+        assert_eq!(mailbox.next(), messages(1, &[2, 3]));
+        assert_eq!(mailbox.next(), messages(2, &[9]));
         assert_eq!(mailbox.next(), None);
     }
 
@@ -143,13 +153,15 @@ mod tests {
         let mut mailbox = Mailbox::default();
         mailbox.put_image(1, bytes(9));
         assert!(!mailbox.takes_image(1, 1) && mailbox.takes_image(2, 1));
-        mailbox.drawn(1);
+        mailbox.answered(1);
         assert!(!mailbox.takes_image(1, 1), "a pong before the image was sent");
+        mailbox.put_small(3, vec![bytes(1)]);
         mailbox.next();
-        assert!(!mailbox.takes_image(1, 1), "sent and not drawn");
-        mailbox.drawn(0);
-        assert!(!mailbox.takes_image(1, 1), "an older pong");
-        mailbox.drawn(1);
+        mailbox.next();
+        assert!(!mailbox.takes_image(1, 1), "sent and not read");
+        mailbox.answered(1);
+        assert!(!mailbox.takes_image(1, 1), "the pong of the small message before");
+        mailbox.answered(2);
         assert!(mailbox.takes_image(1, 1));
     }
 
@@ -168,6 +180,21 @@ mod tests {
     }
 
     #[test]
+    fn who_does_not_answer_gets_few_small_messages_and_then_the_newest() {
+        let mut mailbox = Mailbox::default();
+        let mut sent = 0;
+        for n in 1..100 {
+            mailbox.put_small(1, vec![bytes(n)]);
+            sent += usize::from(mailbox.next().is_some());
+        }
+        assert_eq!(sent, BUNDLES);
+        mailbox.put_image(2, bytes(7));
+        assert_eq!(mailbox.next(), messages(BUNDLES as u64 + 1, &[7]), "an image is not held up");
+        mailbox.answered(BUNDLES as u64 - 1);
+        assert_eq!(mailbox.next(), messages(BUNDLES as u64 + 2, &[99]));
+    }
+
+    #[test]
     fn what_is_not_watched_any_more_is_forgotten() {
         let mut mailbox = Mailbox::default();
         mailbox.put_small(1, vec![bytes(1)]);
@@ -175,11 +202,11 @@ mod tests {
         mailbox.put_image(2, bytes(3));
         mailbox.forget(1);
         assert!(mailbox.takes_image(1, 1) && !mailbox.takes_image(2, 1));
-        assert_eq!(mailbox.next(), Some(Next::Image { number: 2, bytes: bytes(3) }));
+        assert_eq!(mailbox.next(), messages(1, &[3]));
         for _ in 0..100 {
             mailbox.put_problem("x".into());
         }
-        assert_eq!(mailbox.next(), Some(Next::Problem("x".into())));
+        assert_eq!(mailbox.next(), Some(Next { number: 2, content: Content::Problem("x".into()) }));
         assert_eq!(mailbox.next(), None);
     }
 }

@@ -61,7 +61,7 @@ impl Scene {
         &self.options
     }
 
-    /// What is added to a time of the host for UTC.
+    /// Nanoseconds that make UTC of a time of the host.
     pub(super) fn utc_offset_ns(&self) -> i64 {
         offset_ns(&self.utc)
     }

@@ -261,7 +261,7 @@ impl Worker {
     }
 }
 
-/// What is watched; `None`, and the thread ends, when that is nothing.
+/// The watched channels; `None`, and the thread ends, when nobody watches any.
 fn begin(shared: &Shared) -> Option<(Arc<Scene>, Watched)> {
     let mut state = lock(&shared.state);
     let scene = state.scene.clone();

@@ -40,7 +40,7 @@ impl Newest {
     /// Takes the newest frame of a stream, and opens the stream first where needed.
     ///
     /// # Errors
-    /// Why there is none; a camera that is being opened has no channel yet, which is no error.
+    /// Why the stream cannot be read. A camera that is being opened has no channel yet; that is `Ok`.
     pub(crate) fn take(&mut self, id: &StreamId) -> Result<(), Error> {
         self.read(id, |subscriber| subscriber.latest().map(|frame| Vec::from_iter(frame)))
             .map(|frames| drop(frames.into_iter().next_back().map(|f| self.frames.insert(id.clone(), f))))

@@ -1,7 +1,8 @@
 """`python -m depthrig.view`: the streams of a running rig in the rerun viewer, each where it is on the mount.
 
-Of each stream the newest frame is sent, at most `--rate` times a second. Images are at `/RIG/CAMERA/STREAM`, with `Transform3D` and `Pinhole` from
-the frame's header, so that the viewer unprojects depth into points. The timeline is `capture`, the time of the exposure.
+Of each stream the newest frame is sent, at most `--rate` times a second. Images are at `/RIG/CAMERA/STREAM`, with
+`Transform3D` and `Pinhole` from the frame's header, so that the viewer unprojects depth into points. The timeline is
+`capture`, the time of the exposure.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ examples:
 class View:
     """Frames of a rig as entities of a rerun recording.
 
-    `recording` is a `rerun.RecordingStream`. With `jpeg`, a quality, colour is sent as JPEG, which takes a tenth of the memory.
+    `recording` is a `rerun.RecordingStream`. With `jpeg`, a quality, colour is sent as JPEG: a tenth of the memory.
     """
 
     def __init__(self, rerun: ModuleType, recording: Any, jpeg: int | None = None) -> None:

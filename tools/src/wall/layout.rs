@@ -1,7 +1,5 @@
 //! Where tiles lie on the screen, in rows and columns of characters.
 
-use super::terminal::Cell;
-
 /// Smallest tile: narrower or lower ones show nothing.
 const MIN_COLUMNS: usize = 12;
 const MIN_ROWS: usize = 4;
@@ -9,6 +7,15 @@ const MIN_ROWS: usize = 4;
 const GAP: usize = 1;
 /// Sides of a usual image.
 const ASPECT: f64 = 16.0 / 9.0;
+
+/// Size of a character in pixels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Cell {
+    /// Width.
+    pub width: usize,
+    /// Height.
+    pub height: usize,
+}
 
 /// A part of the screen.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -51,7 +58,7 @@ pub struct Grid {
 }
 
 impl Grid {
-    /// The largest tiles that show `count` streams; fewer streams where there is no room for all.
+    /// The largest tiles that show `count` streams; fewer streams where not all have room.
     pub fn new(count: usize, area: Area, cell: Cell) -> Self {
         for shown in (1..=count).rev() {
             let fitting = (1..=shown).filter_map(|per_row| Self::with(shown, per_row, area));

@@ -1,6 +1,6 @@
 //! The means by which a terminal shows images, and the questions that find out.
 
-use super::layout::{Area, Grid, Place};
+use super::layout::{Area, Cell, Grid, Place};
 use super::{blocks, kitty, sixel};
 use crate::screen::{self, Screen};
 use anyhow::Result;
@@ -10,9 +10,8 @@ use image::RgbImage;
 
 /// Time that a terminal gets to answer; one at the other end of the world takes a third of it.
 const ANSWER: Duration = Duration::from_secs(1);
-/// Largest image of a tile, pixels: more is not seen at this size, and costs bytes.
-const MAX_WIDTH: u32 = 320;
-const MAX_HEIGHT: u32 = 240;
+/// Pixels of all images together: more would make each rarer.
+const PIXELS: f64 = 500_000.0;
 /// Asks for a character's size (XTWINOPS 16) and for the attributes of the terminal (DA1), which every terminal answers.
 const SIZE_AND_ATTRIBUTES: &str = "\x1b[16t\x1b[c";
 /// The attribute of terminals with sixel graphics.
@@ -38,15 +37,6 @@ impl Means {
             Self::Blocks => "blocks",
         }
     }
-}
-
-/// Size of a character in pixels.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Cell {
-    /// Width.
-    pub width: usize,
-    /// Height.
-    pub height: usize,
 }
 
 /// That of a terminal that does not say.
@@ -114,7 +104,7 @@ fn cell_of(answer: &[u8]) -> Option<Cell> {
     Some(Cell { width: side(width)?, height: side(height)? })
 }
 
-/// What is between `start` and `end` of the first such sequence of numbers.
+/// The text between `start` and `end` of the first such sequence of numbers.
 fn sequence(answer: &[u8], start: &str, end: char) -> Option<String> {
     let text = String::from_utf8_lossy(answer);
     text.split(start).skip(1).find_map(|rest| {
@@ -129,10 +119,13 @@ impl Terminal {
         let (columns, rows) = (grid.columns as u32, grid.rows as u32);
         match self.means {
             Means::Blocks => Size { width: columns, height: 2 * rows },
-            Means::Kitty | Means::Sixel => Size {
-                width: (columns * self.cell.width as u32).min(MAX_WIDTH),
-                height: (rows * self.cell.height as u32).min(MAX_HEIGHT),
-            },
+            Means::Kitty | Means::Sixel => {
+                let room = (columns * self.cell.width as u32, rows * self.cell.height as u32);
+                let pixels = f64::from(room.0) * f64::from(room.1) * grid.shown as f64;
+                let scale = (PIXELS / pixels).sqrt().min(1.0);
+                let side = |n: u32| (f64::from(n) * scale) as u32;
+                Size { width: side(room.0), height: side(room.1) }
+            }
         }
     }
 
@@ -146,7 +139,7 @@ impl Terminal {
         }
     }
 
-    /// Erases the images that are no characters of the page.
+    /// Erases the images that are not made of characters.
     pub const fn erase_all(self) -> &'static str {
         match self.means {
             Means::Kitty => kitty::ERASE,
