@@ -7,7 +7,7 @@ import { preferredStream } from "./skew.js";
 /** @typedef {import("./tile.js").Tile} Tile */
 
 const WIDTH = 640;
-const COVERED = "rgb(111 208 140 / 28%)";
+const COVERED = "rgb(111 208 140 / 18%)";
 const CORNER = "#6fd08c";
 const WANTED = "#f2c14e";
 

@@ -628,7 +628,7 @@ CAPTURE = {
                 "corners": 2,
                 "at": [[0.5, 0.5], [0.6, 0.5]],
                 "views": 7,
-                "coverage": [0, 3, 0, 0],
+                "coverage": [0, 3, 0, 9],
                 "coverage_columns": 2,
                 "worst_px": 0.72,
                 "missing": [f"7 of 12 views {MARKUP}"],
@@ -665,8 +665,9 @@ def test_a_capture_of_views_is_followed_on_the_images(wall: Wall, rig: Address) 
     post()
     wait_for_text(panel, "Hold still")
     assert panel.inner_text().count(MARKUP) == 3
-    # A corner, a covered part, the outline; not the middle of a part that is not covered.
-    for x, y, is_drawn in ((0.5, 0.5, True), (0.75, 0.25, True), (0.1, 0.1, True), (0.25, 0.75, False)):
+    # A corner, covered parts, the outline; not the middle of a part that is not covered.
+    places = ((0.5, 0.5, True), (0.75, 0.25, True), (0.75, 0.75, True), (0.1, 0.1, True), (0.25, 0.75, False))
+    for x, y, is_drawn in places:
         assert wall.page.evaluate(DRAWN, [x, y]) == is_drawn, f"{x} {y}"
     save_screenshot(wall, "capture")
     # What is drawn goes with the panel, and with the capture.
