@@ -3,12 +3,14 @@
 
 use crate::Scenario;
 use crate::checks::Checks;
+use crate::tally::Tally;
 use crate::vivid::{self, SIZE, Taken};
 use anyhow::Context;
+use core::time::Duration;
 use depthrig_bus::{ClockDomain, FrameFlags, MetadataLevel, PixelFormat};
 use depthrig_driver::{Backend, ErrorKind, MemorySink, unpack};
 use depthrig_usb::controls::ControlValue;
-use depthrig_v4l2::{ClockChoice, MemoryChoice, V4l2Backend, V4l2Config};
+use depthrig_v4l2::{ClockChoice, MemoryChoice, Node, V4l2Backend, V4l2Config};
 use v4l::buffer::Type;
 use v4l::io::traits::CaptureStream;
 use v4l::video::Capture;
