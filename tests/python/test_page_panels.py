@@ -480,6 +480,8 @@ def test_doctor_shows_what_the_api_found(wall: Wall, rig: Address) -> None:
         # Numbers change from one to the next.
         assert finding["why"] in panel.inner_text()
         assert finding["cure"] in panel.inner_text()
+    # The rig that answers is no rig that is in its own way.
+    assert "runs already" not in panel.inner_text()
     assert "doctor" in wall.page.inner_text("#ready")
     save_screenshot(wall, "doctor")
 
