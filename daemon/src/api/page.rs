@@ -169,10 +169,10 @@ mod tests {
     #[test]
     fn a_known_file_is_not_sent_again() {
         let file = FILES.iter().find(|f| f.path() == "/").unwrap();
-        let first = file.answer(None);
+        let first = file.answer(None, false);
         assert_eq!(first.status(), StatusCode::OK);
         let tag = first.headers()[header::ETAG].clone();
-        assert_eq!(file.answer(Some(&tag)).status(), StatusCode::NOT_MODIFIED);
+        assert_eq!(file.answer(Some(&tag), true).status(), StatusCode::NOT_MODIFIED);
         assert!(first.headers().contains_key(header::CONTENT_SECURITY_POLICY));
     }
 }

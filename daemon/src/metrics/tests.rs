@@ -105,6 +105,7 @@ fn rig() -> RigStatus {
             spread_p95_ms: 15.0,
             spread_p99_ms: 16.0,
             spread_max_ms: 20.0,
+            skews: Vec::new(),
         },
         recording: Some(RecordingStatus {
             active: true,

@@ -80,7 +80,8 @@ fn without_the_token_the_port_serves_numbers_and_nothing_else() {
         exchange(served.port(), text.replacen("\r\n", &format!("\r\n{line}"), 1).as_bytes())
     };
     // The address of a report is a secret of its own, and this is none.
-    let (reports, others): (Vec<_>, Vec<_>) = ROUTES.iter().partition(|r| r.path.starts_with("/v1/report/"));
+    let is_report = |r: &&api::Route| r.path.starts_with("/v1/report/");
+    let (reports, others): (Vec<&api::Route>, Vec<&api::Route>) = ROUTES.iter().partition(is_report);
     assert_eq!(reports.len(), 1);
     assert_eq!(bare("GET", "/v1/report/0123", "").status, 404);
     for route in others {

@@ -138,6 +138,7 @@ fn stream(images: Vec<FakeImage>, end: Option<ErrorKind>, both: bool) -> (Realse
         .unwrap(),
         memory: Arc::clone(&memory),
         imu: None,
+        panel: None,
     };
     (RealsenseStream::new(parts), memory)
 }
