@@ -43,6 +43,7 @@ use depthrig_sim::synthetic::{Drawing, DrawingProgress};
 use depthrig_usb::SysRoot;
 pub use join::near_pair_ns;
 use std::collections::BTreeMap;
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard};
@@ -264,6 +265,11 @@ impl Rig {
     /// How far the scenes of simulated cameras are rendered; `None` when there is nothing to render.
     pub fn drawing(&self) -> Option<DrawingProgress> {
         self.inner.drawing()
+    }
+
+    /// The port of the live page, if one is served.
+    pub fn port(&self) -> Option<SocketAddr> {
+        self.api.as_ref().and_then(ServerHandle::tcp)
     }
 
     /// The rig's control.

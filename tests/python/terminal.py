@@ -126,7 +126,7 @@ class Terminal:
             time.sleep(0.02)
         time.sleep(0.1)
         assert self.written.rindex(LEAVE) > self.written.rindex(b"\x1b[?1049h")
-        assert termios.tcgetattr(self.slave) == self.before
+        assert termios.tcgetattr(self.slave) == self.before, "the keyboard is not as it was"
         return code
 
     def close(self) -> None:

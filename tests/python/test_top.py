@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from page import FAR, HOLE, MIDDLE, NEAR, PATCHES, SIMULATED, Patch, files_camera, pattern
+from page import FAR, HOLE, MIDDLE, NEAR, PATCHES, SIMULATED, Patch, files_camera, pattern, until
 from PIL import Image
 from terminal import ATTRIBUTES_QUESTION, KITTY, KITTY_QUESTION, PLAIN, SIXEL, Terminal, terminal
 from test_daemon import WAIT_S, binary, command, running, runtime
@@ -60,7 +60,7 @@ def check(color: Image.Image, depth: Image.Image, error: int) -> None:
 def test_half_blocks_show_the_cameras_colours(binary: str, runtime: Path) -> None:
     with terminal(binary, runtime, "--images=blocks") as shown:
         shown.wait_for("still/depth", "streaming", "images as blocks", "▀")
-        time.sleep(1)
+        time.sleep(2)
         check(shown.block_image("still/color"), shown.block_image("still/depth"), ERROR)
         assert shown.block_image("moving/color").width > 20
         shown.type(b"q")
@@ -71,7 +71,7 @@ def test_half_blocks_show_the_cameras_colours(binary: str, runtime: Path) -> Non
 def test_sixel_images_show_the_cameras_colours(binary: str, runtime: Path, tmp_path: Path) -> None:
     with terminal(binary, runtime, "--images", answer=SIXEL) as shown:
         shown.wait_for("images as sixel")
-        time.sleep(2)
+        until(lambda: shown.written.count(b"\x1bP0;1;0q") >= 8)
         places = {stream: shown.label(stream) for stream in ("still/color", "still/depth")}
         shown.type(b"q")
         assert shown.ends() == 0
@@ -84,7 +84,7 @@ def test_sixel_images_show_the_cameras_colours(binary: str, runtime: Path, tmp_p
 def test_kitty_images_show_the_cameras_colours(binary: str, runtime: Path) -> None:
     with terminal(binary, runtime, "--images", answer=KITTY) as shown:
         shown.wait_for("images as kitty")
-        time.sleep(2)
+        until(lambda: shown.written.count(b"\x1b_Ga=T") >= 8)
         places = {stream: shown.label(stream) for stream in ("still/color", "still/depth")}
         shown.type(b"q")
         assert shown.ends() == 0

@@ -22,6 +22,8 @@ const HOME: &str = "\x1b[H";
 const CLEAR: &str = "\x1b[2J";
 const CLEAR_LINE: &str = "\x1b[K";
 const CLEAR_BELOW: &str = "\x1b[J";
+/// A terminal that takes no byte for this long is not given back.
+const STALLED: Timespec = Timespec { tv_sec: 2, tv_nsec: 0 };
 
 /// State to give back with a terminal that is taken: the settings of its keyboard, and the messages of panics, which
 /// would be lost with the page.
@@ -174,11 +176,10 @@ pub fn restore() {
     if let Some(keyboard) = &taken.keyboard {
         let _ = termios::tcsetattr(std::io::stdin(), OptionalActions::Now, keyboard);
     }
-    // Not for one that takes no bytes: it would keep the process from ending.
+    // Not for one that takes no bytes any more: it would keep the process from ending.
     let stdout = std::io::stdout();
     let mut fds = [PollFd::new(&stdout, PollFlags::OUT)];
-    let now = Timespec { tv_sec: 0, tv_nsec: 0 };
-    if poll(&mut fds, Some(&now)).is_ok_and(|n| n > 0) {
+    if poll(&mut fds, Some(&STALLED)).is_ok_and(|n| n > 0) {
         let _ = rustix::io::write(&stdout, LEAVE.as_bytes());
     }
     for message in taken.panics {

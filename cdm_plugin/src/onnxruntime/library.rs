@@ -57,8 +57,8 @@ fn missing(what: &str, device: &Device) -> Error {
     let package = device.package();
     let message = format!(
         "ONNX Runtime was not found: {what}, and no libonnxruntime.so is there. In a checkout run \
-         `tools/onnxruntime.sh {variant}`; elsewhere `pip install {package}`, in the Python environment of depthrig or \
-         in another one whose folder onnxruntime/capi {VARIABLE} or the setting `library` names",
+         `tools/onnxruntime.sh {variant}`; elsewhere `pip install {package}` into the Python environment of depthrig, or \
+         into any other and set {VARIABLE} or the setting `library` to its folder onnxruntime/capi",
         variant = device.variants()[0],
     );
     Error::new(ErrorKind::NoEngine, message)

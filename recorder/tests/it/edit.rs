@@ -3,7 +3,8 @@
 use crate::support::*;
 use depthrig_recorder::fs::{Fault, Fs, MemFs, RealFs};
 use depthrig_recorder::{
-    Dataset, Edit, ErrorKind, NOTE_MAX_BYTES, SESSION_FILE, Session, SessionChanges, check_name, edit, rename,
+    Dataset, Edit, ErrorKind, Mark, NOTE_MAX_BYTES, SESSION_FILE, Session, SessionChanges, check_name, edit,
+    look_at, rename,
 };
 use proptest::prelude::*;
 use std::path::PathBuf;
@@ -43,12 +44,14 @@ fn an_edit_changes_the_session_file_alone_and_is_in_the_history() {
         scene: Some("a \"kitchen\"\nwith two lines".into()),
         operator: Some(String::new()),
         notes: vec!["the cup was moved".into()],
+        mark: Some(Some(Mark::Bad)),
     };
     let edits = edit(&fs, &dir(), &changes).unwrap();
     let expected = [
         ("scene", "a table", "a \"kitchen\"\nwith two lines"),
         ("operator", "nobody", ""),
         ("notes", "", "the cup was moved"),
+        ("mark", "", "bad"),
     ];
     assert_eq!(edits.iter().map(change).collect::<Vec<_>>(), expected);
     let session = open(&fs).session().clone();
@@ -75,6 +78,26 @@ fn undone_is_not_forgotten_and_the_same_again_is_no_change() {
     assert_eq!(session.scene, "a table");
     let history: Vec<_> = session.history.iter().map(change).collect();
     assert_eq!(history, [("scene", "a table", "a chair"), ("scene", "a chair", "a table")]);
+}
+
+#[test]
+fn a_mark_is_in_the_catalog_and_can_be_taken_back() {
+    let fs = recorded();
+    let before = text(&fs);
+    let mark = |mark| edit(&fs, &dir(), &SessionChanges { mark: Some(mark), ..Default::default() }).unwrap();
+    assert_eq!(mark(None), []);
+    assert_eq!(text(&fs), before);
+    mark(Some(Mark::Good));
+    assert_eq!(look_at(&fs, &dir()).mark, Some(Mark::Good));
+    assert!(text(&fs).contains("\nmark = \"good\"\n"), "{}", text(&fs));
+    mark(Some(Mark::Bad));
+    assert_eq!(look_at(&fs, &dir()).mark, Some(Mark::Bad));
+    let edits = mark(None);
+    assert_eq!(edits.iter().map(Edit::text).collect::<Vec<_>>(), ["mark bad removed"]);
+    assert_eq!(look_at(&fs, &dir()).mark, None);
+    assert!(!text(&fs).contains("\nmark = "));
+    let session = open(&fs).session().clone();
+    assert_eq!(session.history.iter().filter(|e| e.field == "mark").count(), 3);
 }
 
 #[test]

@@ -66,6 +66,9 @@ pub fn run(args: &RunArgs, context: &Context) -> Result<Exit> {
     }
     let stop = Stop::on_signals()?;
     let Started { rig, .. } = start(config, context.runtime()?, true, None, context.global.quiet > 0)?;
+    if let Some(port) = rig.port().filter(|_| context.global.quiet == 0) {
+        out::note(format_args!("live page: http://{port}/, open it with: depthrig open"));
+    }
     let control = rig.control();
     if let Some(directory) = &args.record
         && wait_until_drawn(&rig, &stop, context.global.quiet > 0)

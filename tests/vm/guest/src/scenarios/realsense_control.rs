@@ -14,7 +14,7 @@ use depthrig_realsense::RealsenseBackend;
 use depthrig_realsense::config::{Emitter, MetadataWish, RealsenseConfig, TransportChoice};
 use depthrig_usb as usb;
 use depthrig_usb::SysRoot;
-use depthrig_usb::controls::ControlValue;
+use depthrig_usb::controls::{ControlState, ControlValue};
 use depthrig_usb::uvc::control::{ControlPort, Query};
 use depthrig_v4l2::Node;
 
@@ -71,6 +71,45 @@ fn nodes(camera: &Camera) -> anyhow::Result<(Node, Node)> {
     }
 }
 
+/// Controls change while the camera streams.
+fn running_controls(checks: &mut Checks, stream: &mut dyn Stream, tally: &mut Tally) -> anyhow::Result<()> {
+    let panel = stream.controls().and_then(|weak| weak.upgrade());
+    let Some(panel) = panel else { anyhow::bail!("a running D435 has no controls") };
+    let value = |key: &str| -> anyhow::Result<Option<ControlValue>> {
+        Ok(panel.list()?.iter().find(|c| c.key == key).and_then(ControlState::file_value))
+    };
+    checks.equal("the emitter is listed by name", value("emitter")?, Some(ControlValue::Item("off".into())));
+    checks.equal("the exposure is listed", value("exposure_us")?, Some(ControlValue::Integer(5000)));
+    for (key, new) in [
+        ("exposure_us", ControlValue::Integer(7000)),
+        ("emitter", ControlValue::Item("laser".into())),
+        ("laser_power_mw", ControlValue::Integer(120)),
+        ("gain", ControlValue::Integer(32)),
+        ("color_controls.white_balance_temperature", ControlValue::Integer(4000)),
+    ] {
+        panel.set(key, &new)?;
+        checks.equal(&format!("{key} changes while it streams"), value(key)?, Some(new));
+    }
+    for (key, wrong) in [
+        ("laser_power_mw", ControlValue::Integer(100)),
+        ("emitter", ControlValue::Item("sun".into())),
+        ("color_controls.no_such", ControlValue::Integer(1)),
+        ("no_such", ControlValue::Integer(1)),
+    ] {
+        let e = panel.set(key, &wrong).err().map(|e| e.kind());
+        checks.equal(&format!("{key} = {wrong} is refused"), e, Some(ErrorKind::BadInput));
+    }
+    let before = tally.of(0).count();
+    tally.poll_for(stream, SECOND)?;
+    let exposures: Vec<_> = tally.of(0).skip(before).map(|f| f.meta.exposure_ns).collect();
+    checks.that(
+        "frames have the new exposure",
+        exposures.last() == Some(&7_000_000),
+        format!("{:?}", exposures.last()),
+    );
+    Ok(())
+}
+
 /// Settings are in the camera afterwards; invalid ones are refused with the accepted values.
 fn settings(checks: &mut Checks, camera: &Camera) -> anyhow::Result<()> {
     let color = [
@@ -116,6 +155,7 @@ fn settings(checks: &mut Checks, camera: &Camera) -> anyhow::Result<()> {
         exposures.iter().all(|ns| *ns == 5_000_000),
         format!("{:?}", exposures.first()),
     );
+    running_controls(checks, stream.as_mut(), &mut tally)?;
     drop(stream);
     let refused = |config: RealsenseConfig| start(config).err();
     let e = refused(RealsenseConfig { laser_power_mw: Some(100), ..config(camera) });

@@ -3,12 +3,14 @@
 
 use crate::Scenario;
 use crate::checks::Checks;
+use crate::tally::Tally;
 use crate::vivid::{self, SIZE, Taken};
 use anyhow::Context;
+use core::time::Duration;
 use depthrig_bus::{ClockDomain, FrameFlags, MetadataLevel, PixelFormat};
 use depthrig_driver::{Backend, ErrorKind, MemorySink, unpack};
 use depthrig_usb::controls::ControlValue;
-use depthrig_v4l2::{ClockChoice, MemoryChoice, V4l2Backend, V4l2Config};
+use depthrig_v4l2::{ClockChoice, MemoryChoice, Node, V4l2Backend, V4l2Config};
 use v4l::buffer::Type;
 use v4l::io::traits::CaptureStream;
 use v4l::video::Capture;
@@ -86,11 +88,37 @@ fn controls(checks: &mut Checks) -> anyhow::Result<()> {
         &error,
     );
     set("brightness", ControlValue::Integer(128))?;
+    running_controls(checks, &node)?;
     let mut config = vivid::config(0);
     config.controls.push(("no_such".to_owned(), ControlValue::Boolean(true)));
     let started = vivid::start(config, &vivid::request(PixelFormat::Yuyv)?);
     let error = started.err().context("a bad control")?;
     checks.equal("a rig with an unknown control does not start", error.kind(), ErrorKind::BadInput);
+    Ok(())
+}
+
+/// Controls change while it streams, and are gone with the stream.
+fn running_controls(checks: &mut Checks, node: &Node) -> anyhow::Result<()> {
+    let mut stream = vivid::start(vivid::config(0), &vivid::request(PixelFormat::Yuyv)?)?;
+    let mut tally = Tally::default();
+    tally.poll_for(stream.as_mut(), Duration::from_millis(300))?;
+    let weak = stream.controls().context("no controls")?;
+    let panel = weak.upgrade().context("the controls are gone")?;
+    panel.set("controls.brightness", &ControlValue::Integer(99))?;
+    let listed = panel.list()?;
+    let brightness = listed.iter().find(|c| c.key == "controls.brightness").context("brightness")?;
+    checks.equal("a control of a running camera changes", brightness.value, Some(99));
+    checks.equal("another program reads the same", node.read_control(&brightness.control)?, 99);
+    checks.that("its list has what a rig file can set", listed.len() > 8, listed.len());
+    let refused = panel.set("controls.brightness", &ControlValue::Integer(256));
+    checks.that("a value out of range is refused while it runs", refused.is_err(), "");
+    checks.that("so is an unknown key", panel.set("brightness", &ControlValue::Integer(1)).is_err(), "");
+    let before = tally.of(0).count();
+    tally.poll_for(stream.as_mut(), Duration::from_millis(300))?;
+    checks.that("it streams on", tally.of(0).count() > before, before);
+    panel.set("controls.brightness", &ControlValue::Integer(128))?;
+    drop((panel, stream));
+    checks.that("the controls go with the stream", weak.upgrade().is_none(), "");
     Ok(())
 }
 
