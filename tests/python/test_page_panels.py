@@ -353,12 +353,15 @@ def test_a_recording_that_was_removed_meanwhile_leaves_the_list(wall: Wall, rig:
 
 def test_odd_recordings_are_listed_with_why(wall: Wall, rig: Address, folder: Path) -> None:
     base = folder / "datasets" / record(rig)
-    shutil.copytree(base, base.with_name("cut"))
-    (base.with_name("cut") / "session.toml").write_text("format = [[[")
-    shutil.copytree(base, base.with_name("later"))
-    text = (base.with_name("later") / "session.toml").read_text()
-    (base.with_name("later") / "session.toml").write_text(re.sub(r'(?m)^format = .*$', 'format = "depthrig-99"', text))
+    # Nothing may be written into it any more while it is copied.
+    until((base / "report.html").is_file)
+    cut, later = base.with_name("cut"), base.with_name("later")
     try:
+        for copy in (cut, later):
+            shutil.copytree(base, copy, ignore=shutil.ignore_patterns(".*", "*.tmp"))
+        text = (later / "session.toml").read_text()
+        (later / "session.toml").write_text(re.sub(r"(?m)^format = .*$", 'format = "depthrig-99"', text))
+        (cut / "session.toml").write_text("format = [[[")
         panel = open_panel(wall, "l", "Recordings")
         for name in ("cut", "later"):
             entry = row(wall, name)
@@ -374,8 +377,8 @@ def test_odd_recordings_are_listed_with_why(wall: Wall, rig: Address, folder: Pa
             wall.page.get_by_text("Back to live", exact=True).click()
             wall.wait_for_image("still/color")
     finally:
-        shutil.rmtree(base.with_name("cut"))
-        shutil.rmtree(base.with_name("later"))
+        for copy in (cut, later):
+            shutil.rmtree(copy, ignore_errors=True)
 
 
 def test_one_that_is_being_recorded_says_so(wall: Wall, folder: Path) -> None:
