@@ -1,5 +1,8 @@
 //! Keys of a terminal, apart from the escape sequences between them: arrows, pasted text, late answers to questions.
 
+const ESC: u8 = 0x1b;
+const BEL: u8 = 0x07;
+
 /// Separates keys from escape sequences (ECMA-48), byte by byte.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Keys {
@@ -19,19 +22,27 @@ pub enum Keys {
 impl Keys {
     /// The key that a byte is, if it is one.
     pub fn next(&mut self, byte: u8) -> Option<u8> {
-        let (state, key) = match (*self, byte) {
-            (Self::Plain | Self::Escape, 0x1b) => (Self::Escape, None),
-            (Self::Plain, key) => (Self::Plain, Some(key)),
-            (Self::Escape, b'[' | b'O') => (Self::Control, None),
-            (Self::Escape, b'_' | b'P' | b']' | b'^' | b'X') => (Self::Text, None),
-            (Self::Control, 0x40..=0x7e) | (Self::Text, 0x07) | (Self::Escape, _) => (Self::Plain, None),
-            (Self::Control, _) => (Self::Control, None),
-            (Self::Text, 0x1b) => (Self::TextEscape, None),
-            (Self::TextEscape, b'\\') => (Self::Plain, None),
-            (Self::Text | Self::TextEscape, _) => (Self::Text, None),
+        let state = match *self {
+            Self::Plain if byte != ESC => return Some(byte),
+            Self::Plain => Self::Escape,
+            Self::Escape => match byte {
+                ESC => Self::Escape,
+                b'[' | b'O' => Self::Control,
+                b'_' | b'P' | b']' | b'^' | b'X' => Self::Text,
+                _ => Self::Plain,
+            },
+            Self::Control if (0x40..=0x7e).contains(&byte) => Self::Plain,
+            Self::Control => Self::Control,
+            Self::Text => match byte {
+                ESC => Self::TextEscape,
+                BEL => Self::Plain,
+                _ => Self::Text,
+            },
+            Self::TextEscape if byte == b'\\' => Self::Plain,
+            Self::TextEscape => Self::Text,
         };
         *self = state;
-        key
+        None
     }
 }
 

@@ -2,6 +2,7 @@
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
+use core::fmt::Write as _;
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder as _, RgbImage};
 
@@ -33,7 +34,8 @@ pub fn image(image: &RgbImage, number: usize) -> String {
     let mut out = String::new();
     for (i, part) in parts.enumerate() {
         let head = if i == 0 { format!("a=T,f=100,i={},p=1,C=1,q=2,", number + 1) } else { String::new() };
-        out.push_str(&format!("\x1b_G{head}m={};{part}\x1b\\", u8::from(i < last)));
+        // Writing to a string cannot fail.
+        let _ = write!(out, "\x1b_G{head}m={};{part}\x1b\\", u8::from(i < last));
     }
     out
 }

@@ -43,7 +43,7 @@ pub fn image(image: &RgbImage) -> String {
 fn indices(rgba: &[u8], quantizer: &NeuQuant) -> Vec<u8> {
     let mut known = vec![None; 1 << 15];
     let index = |pixel: &[u8; 4]| {
-        let key = pixel[..3].iter().fold(0, |key, c| key << 5 | usize::from(c >> 3));
+        let key = pixel[..3].iter().fold(0, |key, c| (key << 5) | usize::from(c >> 3));
         *known[key].get_or_insert_with(|| quantizer.index_of(pixel) as u8)
     };
     rgba.as_chunks::<4>().0.iter().map(index).collect()
@@ -58,7 +58,7 @@ fn band(rows: &[u8], width: usize, out: &mut String) {
         let _ = write!(out, "{}#{color}", if i == 0 { "" } else { "$" });
         let column = |x: usize| {
             let bits = rows.iter().skip(x).step_by(width).enumerate();
-            bits.fold(0, |bits, (row, index)| bits | u8::from(index == color) << row)
+            bits.fold(0, |bits, (row, index)| bits | (u8::from(index == color) << row))
         };
         let mut run = 0;
         let mut last = column(0);

@@ -95,13 +95,11 @@ impl Tile {
             PreviewKind::Depth => depth(preview, range),
             PreviewKind::Jpeg => color(preview),
         };
-        match image {
-            Some(image) => Some(super::fitted(image, size.width, size.height)),
-            None => {
-                self.problem = Some("an image cannot be decoded".to_owned());
-                None
-            }
-        }
+        let Some(image) = image else {
+            self.problem = Some("an image cannot be decoded".to_owned());
+            return None;
+        };
+        Some(super::fitted(image, size.width, size.height))
     }
 
     /// Whether nothing new came for that long.
@@ -125,7 +123,7 @@ impl Tile {
         let depth = self.preview.as_ref().filter(|p| p.kind == PreviewKind::Depth);
         depth.into_iter().flat_map(|p| {
             let values = p.bytes.as_chunks::<2>().0;
-            let step = values.len() / SAMPLES | 1;
+            let step = (values.len() / SAMPLES) | 1;
             let metres = |v: &[u8; 2]| f32::from(u16::from_le_bytes(*v)) * p.depth_unit_m;
             values.iter().step_by(step).map(metres).filter(|m| *m > 0.0)
         })
