@@ -336,7 +336,7 @@ def test_topics_schemas_and_bytes_are_those_of_a_recording(
                     continue
                 place = message.publish_time // 2_000_000
                 near = [by_time[channel.topic].get(place + d) for d in (0, 1, -1)]
-                sent = next((m for m in near if m and abs(int(m["time"]) - message.publish_time) < 200_000), None)
+                sent = next((m for m in near if m and abs(int(m["time"]) - message.publish_time) < 2_000_000), None)
                 if sent is None:
                     continue
                 payload = Path(sent["file"]).read_bytes()

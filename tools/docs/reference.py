@@ -102,7 +102,9 @@ def api() -> str:
     text += "`GET /v1/openapi.json` returns the document that this page is made from.\n\n"
     for path, methods in document["paths"].items():
         for method, call in methods.items():
-            text += f"## {method.upper()} {path}\n\n{plain(call['summary'] + ' ' + call.get('description', ''))}\n\n"
+            # A heading that ends in braces would lose them: they are attributes there.
+            shown = path.replace("{", "&#123;").replace("}", "&#125;")
+            text += f"## {method.upper()} {shown}\n\n{plain(call['summary'] + ' ' + call.get('description', ''))}\n\n"
             if body := call.get("requestBody"):
                 text += f"Body: {content(body)}\n\n"
             replies = [[f"`{code}`", plain(r["description"]), content(r)] for code, r in sorted(call["responses"].items())]
