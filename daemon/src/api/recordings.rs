@@ -27,7 +27,7 @@ const IMAGE_COLUMNS: u32 = 320;
 /// The longest report that is sent, bytes; reports are below one megabyte.
 const MAX_REPORT_BYTES: u64 = 32 << 20;
 /// How long the address of a report holds.
-const TICKET_TIME: Duration = Duration::from_secs(60);
+const TICKET_TIME: Duration = Duration::from_mins(1);
 /// Addresses of reports that hold at once; the oldest end first.
 const MAX_TICKETS: usize = 16;
 /// A report has styles and images in it, and no scripts.

@@ -75,6 +75,7 @@ pub(crate) struct Service<'a> {
 /// The form of a request or a response.
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "camelCase")]
+#[allow(clippy::struct_field_names)] // the protocol's names
 pub(crate) struct Schema<'a> {
     pub encoding: &'static str,
     pub schema_name: &'static str,

@@ -42,7 +42,7 @@ impl Newest {
     /// # Errors
     /// Why the stream cannot be read. A camera that is being opened has no channel yet; that is `Ok`.
     pub(crate) fn take(&mut self, id: &StreamId) -> Result<(), Error> {
-        self.read(id, |subscriber| subscriber.latest().map(|frame| Vec::from_iter(frame)))
+        self.read(id, |subscriber| subscriber.latest().map(Vec::from_iter))
             .map(|frames| drop(frames.into_iter().next_back().map(|f| self.frames.insert(id.clone(), f))))
     }
 

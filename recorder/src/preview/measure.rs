@@ -176,8 +176,9 @@ fn sharpness(luma: &[u8], width: usize) -> f64 {
 fn holes(format: PixelFormat, pixels: &[u8]) -> f64 {
     if format.sample() == Sample::F32 {
         let values = pixels.as_chunks().0;
-        let is_hole = |v: &&[u8; 4]| !(f32::from_le_bytes(**v) > 0.0);
-        return values.iter().filter(is_hole).count() as f64 / values.len() as f64;
+        // Not a number is a hole, too.
+        let has_depth = |v: &&[u8; 4]| f32::from_le_bytes(**v) > 0.0;
+        return 1.0 - values.iter().filter(has_depth).count() as f64 / values.len() as f64;
     }
     let values = pixels.as_chunks::<2>().0;
     values.iter().filter(|v| **v == [0, 0]).count() as f64 / values.len() as f64
