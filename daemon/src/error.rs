@@ -45,7 +45,7 @@ impl From<depthrig_recorder::Error> for Error {
     fn from(e: depthrig_recorder::Error) -> Self {
         use depthrig_recorder::ErrorKind as Rec;
         let kind = match e.kind() {
-            Rec::NotFound | Rec::NotADataset => ErrorKind::NotFound,
+            Rec::NotFound => ErrorKind::NotFound,
             Rec::PermissionDenied => ErrorKind::PermissionDenied,
             Rec::InUse => ErrorKind::InUse,
             Rec::DiskFull => ErrorKind::NoSpace,

@@ -43,6 +43,15 @@ model = "d455"
 cheap = true
 motion = true
 pose = { translation_m = [0.1, 0.0, 0.2] }
+# No faster than images are sent: of a faster stream each other frame is left out, which may be all that are recorded.
+[[camera.stream]]
+name = "color"
+rate_hz = 15.0
+[[camera.stream]]
+name = "depth"
+rate_hz = 15.0
+[[camera.stream]]
+name = "imu"
 """
 JPEG_ERROR = 12
 """Most that a colour of an even patch changes."""

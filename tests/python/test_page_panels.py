@@ -744,9 +744,12 @@ def test_the_list_of_recordings_is_used_with_the_keyboard(wall: Wall, rig: Addre
     focused = "() => document.activeElement.closest('li')?.dataset.name"
     assert wall.page.evaluate(focused) == newest[1]
     # Space presses the button that has the focus, and starts no recording.
+    wall.wait_for_state("#record-state", "idle")
     press(wall, "Space")
     until(lambda: button(row(wall, newest[1]), "Good").get_attribute("aria-pressed") == "true")
     assert wall.page.evaluate(focused) == newest[1]
+    # As long as a start would need to show.
+    wall.page.wait_for_timeout(1000)
     assert wall.state("#record-state") == "idle"
     press(wall, "Escape")
     assert not wall.page.locator("#panel").is_visible()

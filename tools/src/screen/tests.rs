@@ -2,6 +2,7 @@ use super::*;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use std::fs::OpenOptions;
 use std::io::Read;
+use std::os::unix::fs::OpenOptionsExt;
 use std::process::Command;
 
 /// Set for the process that takes its terminal and panics.
@@ -17,7 +18,11 @@ fn a_panic_gives_the_terminal_back_and_its_message_is_seen() {
     grantpt(&master).unwrap();
     unlockpt(&master).unwrap();
     let name = ptsname(&master, Vec::new()).unwrap();
-    let slave = OpenOptions::new().read(true).write(true).open(name.to_str().unwrap()).unwrap();
+    // Of a process that leads a session it would become the terminal, whose end would end the process.
+    let flags = rustix::fs::OFlags::NOCTTY.bits() as i32;
+    let mut options = OpenOptions::new();
+    options.read(true).write(true).custom_flags(flags);
+    let slave = options.open(name.to_str().unwrap()).unwrap();
     let before = termios::tcgetattr(&slave).unwrap();
     let test = "screen::tests::a_panic_gives_the_terminal_back_and_its_message_is_seen";
     let mut child = Command::new(std::env::current_exe().unwrap())
