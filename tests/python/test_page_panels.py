@@ -148,7 +148,7 @@ def test_a_recording_comes_into_the_list_with_an_image_and_is_marked(wall: Wall,
     dataset = datasets(folder)[-1]
     entry = row(wall, dataset.name)
     entry.wait_for()
-    until(lambda: wall.page.evaluate(THUMB, [dataset.name, 0.5, 0.5]))
+    until(lambda: wall.page.evaluate(THUMB, [dataset.name, 0.5, 0.5]), entry.inner_text)
     for mark, other in (("Good", "Bad"), ("Bad", "Good")):
         button(entry, mark).click()
         until(lambda mark=mark: session(dataset).get("mark") == mark.lower(), lambda: session(dataset))

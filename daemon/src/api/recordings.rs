@@ -24,6 +24,8 @@ use std::sync::{Arc, Mutex};
 const MAX_LISTED: usize = 50;
 /// Columns of an image of a recording at the most.
 const IMAGE_COLUMNS: u32 = 320;
+/// Sets that are looked into for such an image.
+const IMAGE_TRIES: usize = 8;
 /// The longest report that is sent, bytes; reports are below one megabyte.
 const MAX_REPORT_BYTES: u64 = 32 << 20;
 /// How long the address of a report holds.
@@ -121,13 +123,15 @@ pub(super) fn image(rig: &dyn Control, name: &str) -> Result<Response> {
     let middle = sets.times().len() / 2;
     let none =
         || Error::new(ErrorKind::NotFound, format!("recording {name:?} has no image in colour or grey"));
-    if sets.times().is_empty() {
-        return Err(none());
-    }
-    let set = sets.read(middle, PixelMode::Stored)?;
     let is_seen =
-        |f: &&depthrig_recorder::DatasetFrame| f.header.pixel_format().is_some_and(|p| !p.is_depth());
-    let frame = set.frames.iter().find(is_seen).ok_or_else(none)?;
+        |f: &depthrig_recorder::DatasetFrame| f.header.pixel_format().is_some_and(|p| !p.is_depth());
+    // A set may be incomplete, and a damaged one says nothing of its neighbours.
+    let around = (middle..sets.times().len()).chain(0..middle).take(IMAGE_TRIES);
+    let mut frames = around.filter_map(|number| {
+        let set = sets.read(number, PixelMode::Stored).ok()?;
+        set.frames.into_iter().find(is_seen)
+    });
+    let frame = frames.next().ok_or_else(none)?;
     let image = preview(&frame.header, &frame.decoded()?, IMAGE_COLUMNS)?;
     let kind = (header::CONTENT_TYPE, "image/jpeg");
     Ok(([kind, (header::CACHE_CONTROL, "private, max-age=3600")], image.bytes).into_response())
