@@ -29,8 +29,9 @@ export class RecordingRow {
   #bad;
   #watch;
   #report;
-  /** Whether its image was asked for. */
-  isImageAsked = false;
+  hasImage = false;
+  /** The health it had when its image was asked for; empty: it was not. */
+  imageAskedAs = "";
 
   /**
    * @param {RecordingEntry} entry
@@ -101,6 +102,7 @@ export class RecordingRow {
     const height = bitmap.height * scale;
     context.drawImage(bitmap, (IMAGE_WIDTH - width) / 2, (IMAGE_HEIGHT - height) / 2, width, height);
     bitmap.close();
+    this.hasImage = true;
     this.#canvas.hidden = false;
     this.#noImage.hidden = true;
   }

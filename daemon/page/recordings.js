@@ -159,8 +159,9 @@ export class Recordings {
     } else {
       row.update(entry);
     }
-    if (!row.isImageAsked && entry.health !== "recording") {
-      row.isImageAsked = true;
+    // One that is being closed may have none yet.
+    if (!row.hasImage && row.imageAskedAs !== entry.health && entry.health !== "recording") {
+      row.imageAskedAs = entry.health;
       this.#wanted.push(row);
     }
     return row;

@@ -114,7 +114,8 @@ pub(super) fn folder(rig: &dyn Control, name: &str) -> Result<PathBuf> {
         || Error::new(ErrorKind::NotFound, format!("{} has no recording {name:?}", directory.display()));
     let path =
         allowed::below(&directory.join(name), core::slice::from_ref(&directory)).map_err(|_| missing())?;
-    if name.is_empty() || !path.is_dir() { Err(missing()) } else { Ok(path) }
+    let is_the_folder = directory.canonicalize().is_ok_and(|directory| directory == path);
+    if is_the_folder || !path.is_dir() { Err(missing()) } else { Ok(path) }
 }
 
 /// A small JPEG from its middle.
