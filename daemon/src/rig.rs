@@ -10,25 +10,22 @@
 //! ```
 
 mod assembly;
+mod control;
 mod controls;
 mod join;
 mod motion;
 pub(crate) mod report;
 
 use crate::api::{self, ServerHandle};
-use crate::attached::System;
 use crate::camera::{Camera, Shared, Supervisor};
 use crate::config::RigConfig;
-use crate::control::{
-    CameraControls, Control, ControlChanges, ControlList, ControlRequest, LiveRig, RecordRequest, Shows,
-};
-use crate::doctor::{self, Surroundings};
+use crate::control::{Control, Shows};
 use crate::family::Preparation;
 use crate::housekeeping::Housekeeping;
-use crate::recording::{self, Begun, Outside, Recording, Reports, StreamFacts, recover_left};
+use crate::recording::{Outside, Recording, Reports, StreamFacts, recover_left};
 use crate::sets::SpreadStats;
 use crate::stage::{Intake, Stage};
-use crate::status::{CameraState, RecordingStatus, RigStatus, SetAccount};
+use crate::status::{CameraState, RigStatus, SetAccount};
 use crate::wake::Wake;
 use crate::{Error, ErrorKind, Result, priority};
 use assembly::Assembly;
@@ -40,7 +37,6 @@ use depthrig_cdm::stage::{Installed, Refiners};
 use depthrig_recorder::fs::{Fs, RealFs};
 use depthrig_recorder::{UtcSource, live_late_ns};
 use depthrig_sim::synthetic::{Drawing, DrawingProgress};
-use depthrig_usb::SysRoot;
 pub use join::near_pair_ns;
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
@@ -472,96 +468,6 @@ impl Inner {
 /// Whether the refine stage makes the stream.
 fn is_refined(id: &StreamId) -> bool {
     [depthrig_cdm::stage::REFINED, depthrig_cdm::stage::ALIGNED].contains(&id.stream.as_str())
-}
-
-impl Control for Inner {
-    fn status(&self) -> RigStatus {
-        report::status(self)
-    }
-
-    fn config_text(&self) -> String {
-        self.config.text.clone()
-    }
-
-    fn recording_roots(&self) -> Vec<PathBuf> {
-        let config = &self.config.recording;
-        core::iter::once(&config.directory).chain(&config.allow).cloned().collect()
-    }
-
-    fn recordings(&self) -> Result<PathBuf> {
-        Ok(std::path::absolute(&self.config.recording.directory)
-            .unwrap_or_else(|_| self.config.recording.directory.clone()))
-    }
-
-    fn shows(&self) -> Option<&dyn Shows> {
-        self.shows.as_deref()
-    }
-
-    fn doctor(&self) -> Result<doctor::Examined> {
-        // Doctor would find that a rig of this name runs: it is the one that answers.
-        let around = Surroundings { root: SysRoot::new("/"), runtime: None, measure_disk: false };
-        let system = System::of_rig(&self.config, Some(self.runtime.clone()));
-        doctor::examine_all(&self.config, &around, &system)
-    }
-
-    fn controls(&self) -> Result<ControlList> {
-        controls::list(self)
-    }
-
-    fn set_control(&self, request: &ControlRequest) -> Result<CameraControls> {
-        controls::set(self, request)
-    }
-
-    fn revert_controls(&self, camera: &str) -> Result<CameraControls> {
-        controls::revert(self, camera)
-    }
-
-    fn control_changes(&self) -> Result<ControlChanges> {
-        controls::changes(self)
-    }
-
-    fn save_controls(&self, fingerprint: &str) -> Result<ControlChanges> {
-        controls::save(self, fingerprint)
-    }
-
-    fn record_start(&self, request: &RecordRequest) -> Result<RecordingStatus> {
-        let _one_at_a_time = lock(&self.starting);
-        self.recording().must_be_idle()?;
-        self.must_be_drawn()?;
-        let sets_hz = self.config.sets.rate_hz;
-        // Without the recording's lock: making a file must not keep the set thread waiting.
-        let begun = Begun::new(&self.config, request, self.stream_facts(), sets_hz, &self.outside)?;
-        let status = self.recording().begin(begun);
-        if let Some(note) = controls::note(self)
-            && let Err(e) = self.recording().note(&note)
-        {
-            tracing::warn!("the recording does not say which controls were changed: {e}");
-        }
-        Ok(status)
-    }
-
-    fn record_stop(&self) -> Result<RecordingStatus> {
-        self.finish_held();
-        let stopped = recording::stop(&self.recording);
-        self.closing.store(false, Ordering::Relaxed);
-        let status = stopped?;
-        self.reports.begin(PathBuf::from(&status.path));
-        Ok(status)
-    }
-
-    fn record_note(&self, text: &str) -> Result<()> {
-        self.recording().note(text)
-    }
-
-    fn live(&self) -> Option<LiveRig> {
-        let utc = (self.outside.utc)();
-        Some(recording::live_rig(&self.config, self.stream_facts(), utc))
-    }
-
-    fn request_stop(&self) {
-        self.stop_asked.store(true, Ordering::Relaxed);
-        self.ended.raise();
-    }
 }
 
 /// Adds the scenes of all cameras to the shared drawing.

@@ -19,7 +19,7 @@ import depthrig
 import jsonschema
 import numpy as np
 import pytest
-from page import address, files_camera, pattern, until
+from page import SIMULATED, address, files_camera, pattern, until
 from PIL import Image
 from test_daemon import ROOT, WAIT_S, binary, command, running, runtime
 from test_live import Page, closed
@@ -34,22 +34,8 @@ rig = "lab"
 directory = "datasets"
 color = "raw"
 reserve_mb = 64
-[[camera]]
-name = "front"  # the one in front
-backend = "synthetic"
-model = "generic"
-cheap = true
-[[camera.stream]]
-name = "color"
-width = 320
-height = 240
-rate_hz = 15.0
-[[camera.stream]]
-name = "depth"
-width = 320
-height = 240
-rate_hz = 15.0
-[[camera.fault]]
+"""
+FAULT = """[[camera.fault]]
 kind = "unplug"
 at_s = 0.5
 duration_s = 0.5
@@ -114,7 +100,7 @@ class Rig:
 @pytest.fixture(scope="module")
 def rig(binary: str, runtime: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
     folder = tmp_path_factory.mktemp("lab")
-    (folder / "lab.toml").write_text(RIG + files_camera("still", pattern(folder / "still")))
+    (folder / "lab.toml").write_text(RIG + SIMULATED.format(name="front") + FAULT + files_camera("still", pattern(folder / "still")))
     with running(binary, runtime, folder / "log", "run", str(folder / "lab.toml"), "-q", codes=(0, 3)):
         where = address(binary, runtime, "lab")
         rig = Rig(where.origin, where.token, folder)

@@ -3,6 +3,7 @@
 use super::allowed;
 use super::page::REPORT;
 use crate::control::Control;
+use crate::status::RecordingStatus;
 use crate::{Error, ErrorKind, Result};
 use axum::http::{HeaderName, HeaderValue, header};
 use axum::response::{IntoResponse, Response};
@@ -89,12 +90,13 @@ pub(super) fn list(rig: &dyn Control) -> Result<Recordings> {
     entries.sort_by_key(|e| core::cmp::Reverse(e.started_utc_ns));
     let more = entries.len().saturating_sub(MAX_LISTED);
     entries.truncate(MAX_LISTED);
-    let recordings = entries.into_iter().map(|e| recording(e, &directory, rig)).collect();
+    let running = rig.status().recording;
+    let recordings = entries.into_iter().map(|e| recording(e, &directory, running.as_ref())).collect();
     Ok(Recordings { directory, more, recordings })
 }
 
-fn recording(mut entry: CatalogEntry, directory: &Path, rig: &dyn Control) -> Recording {
-    if let Some(now) = rig.status().recording.filter(|r| r.active && Path::new(&r.path) == entry.path) {
+fn recording(mut entry: CatalogEntry, directory: &Path, running: Option<&RecordingStatus>) -> Recording {
+    if let Some(now) = running.filter(|r| r.active && Path::new(&r.path) == entry.path) {
         entry.health = Health::Recording;
         entry.sets = now.sets;
         entry.duration_ns = (now.duration_s * 1e9) as i64;
@@ -143,7 +145,8 @@ pub(super) fn mark(rig: &dyn Control, request: &MarkRequest) -> Result<Recording
     let path = folder(rig, &request.name)?;
     let changes = SessionChanges { mark: Some(request.mark), ..SessionChanges::default() };
     edit(&RealFs, &path, &changes)?;
-    Ok(recording(look_at(&RealFs, &path), &rig.recordings()?, rig))
+    // One that is being recorded is not edited.
+    Ok(recording(look_at(&RealFs, &path), &rig.recordings()?, None))
 }
 
 /// Addresses of reports.

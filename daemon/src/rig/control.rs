@@ -1,0 +1,104 @@
+//! A rig of cameras as the control API sees it.
+
+use super::{Inner, controls, lock, report};
+use crate::Result;
+use crate::attached::System;
+use crate::control::{
+    CameraControls, Control, ControlChanges, ControlList, ControlRequest, LiveRig, RecordRequest, Shows,
+};
+use crate::doctor::{self, Surroundings};
+use crate::recording::{self, Begun};
+use crate::status::{RecordingStatus, RigStatus};
+use core::sync::atomic::Ordering;
+use depthrig_usb::SysRoot;
+use std::path::PathBuf;
+
+impl Control for Inner {
+    fn status(&self) -> RigStatus {
+        report::status(self)
+    }
+
+    fn config_text(&self) -> String {
+        self.config.text.clone()
+    }
+
+    fn recording_roots(&self) -> Vec<PathBuf> {
+        let config = &self.config.recording;
+        core::iter::once(&config.directory).chain(&config.allow).cloned().collect()
+    }
+
+    fn recordings(&self) -> Result<PathBuf> {
+        Ok(std::path::absolute(&self.config.recording.directory)
+            .unwrap_or_else(|_| self.config.recording.directory.clone()))
+    }
+
+    fn shows(&self) -> Option<&dyn Shows> {
+        self.shows.as_deref()
+    }
+
+    fn doctor(&self) -> Result<doctor::Examined> {
+        // Doctor would find that a rig of this name runs: it is the one that answers.
+        let around = Surroundings { root: SysRoot::new("/"), runtime: None, measure_disk: false };
+        let system = System::of_rig(&self.config, Some(self.runtime.clone()));
+        doctor::examine_all(&self.config, &around, &system)
+    }
+
+    fn controls(&self) -> Result<ControlList> {
+        controls::list(self)
+    }
+
+    fn set_control(&self, request: &ControlRequest) -> Result<CameraControls> {
+        controls::set(self, request)
+    }
+
+    fn revert_controls(&self, camera: &str) -> Result<CameraControls> {
+        controls::revert(self, camera)
+    }
+
+    fn control_changes(&self) -> Result<ControlChanges> {
+        controls::changes(self)
+    }
+
+    fn save_controls(&self, fingerprint: &str) -> Result<ControlChanges> {
+        controls::save(self, fingerprint)
+    }
+
+    fn record_start(&self, request: &RecordRequest) -> Result<RecordingStatus> {
+        let _one_at_a_time = lock(&self.starting);
+        self.recording().must_be_idle()?;
+        self.must_be_drawn()?;
+        let sets_hz = self.config.sets.rate_hz;
+        // Without the recording's lock: making a file must not keep the set thread waiting.
+        let begun = Begun::new(&self.config, request, self.stream_facts(), sets_hz, &self.outside)?;
+        let status = self.recording().begin(begun);
+        if let Some(note) = controls::note(self)
+            && let Err(e) = self.recording().note(&note)
+        {
+            tracing::warn!("the recording does not say which controls were changed: {e}");
+        }
+        Ok(status)
+    }
+
+    fn record_stop(&self) -> Result<RecordingStatus> {
+        self.finish_held();
+        let stopped = recording::stop(&self.recording);
+        self.closing.store(false, Ordering::Relaxed);
+        let status = stopped?;
+        self.reports.begin(PathBuf::from(&status.path));
+        Ok(status)
+    }
+
+    fn record_note(&self, text: &str) -> Result<()> {
+        self.recording().note(text)
+    }
+
+    fn live(&self) -> Option<LiveRig> {
+        let utc = (self.outside.utc)();
+        Some(recording::live_rig(&self.config, self.stream_facts(), utc))
+    }
+
+    fn request_stop(&self) {
+        self.stop_asked.store(true, Ordering::Relaxed);
+        self.ended.raise();
+    }
+}
