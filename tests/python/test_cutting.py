@@ -92,7 +92,8 @@ def test_cut_and_joined_it_is_the_same_recording(
     binary: str, runtime: Path, dataset: Path, tmp_path: Path
 ) -> None:
     before = fingerprint(dataset)
-    ids = sorted({json.loads(x)["set"] for x in command(binary, runtime, "cat", str(dataset), "--json").splitlines()})
+    frames = [json.loads(line) for line in command(binary, runtime, "cat", str(dataset), "--json").splitlines()]
+    ids = sorted({frame["set"] for frame in frames})
     middle = ids[len(ids) // 2]
     first, second, joined = (str(tmp_path / name) for name in ("first", "second", "joined"))
     command(binary, runtime, "trim", str(dataset), first, "--to", "1.0")
@@ -106,7 +107,7 @@ def test_cut_and_joined_it_is_the_same_recording(
         command(binary, runtime, "compare", str(dataset), joined, "--strict", "--pixels", "stored", "--json")
     )
     assert equal["equal"]
-    assert equal["frames"] == len(ids) * 2 * len(CAMERAS)
+    assert equal["frames"] == len(frames)  # on a busy computer a set may lack an image
     returned, text = code(binary, runtime, "compare", str(dataset), first)
     assert returned == 1
     assert "DIFFERENT" in text
