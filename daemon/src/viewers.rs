@@ -7,6 +7,7 @@
 mod geometry;
 mod newest;
 mod pixel;
+mod thread;
 mod worker;
 
 use crate::{Error, ErrorKind, Result};
@@ -21,6 +22,7 @@ pub(crate) use pixel::{PixelAnswer, PixelQuestion};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Condvar, Mutex};
+pub(crate) use thread::work_until_done;
 use tokio::sync::mpsc;
 
 /// Viewers at once.
@@ -115,6 +117,23 @@ struct Viewer {
     credits: u32,
     questions: Vec<PixelQuestion>,
     to: mpsc::Sender<Message>,
+    /// Messages that found no room, since it was last told so.
+    lost: u64,
+}
+
+impl Viewer {
+    /// Sends a message if it reads what is sent to it. What had no room it is told with the next message that has. Whether it was sent.
+    fn put(&mut self, message: Message) -> bool {
+        if self.lost > 0 {
+            let text = format!("{} messages were lost: they come faster than this page reads", self.lost);
+            if self.to.try_send(Message::Problem(text)).is_ok() {
+                self.lost = 0;
+            }
+        }
+        let is_sent = self.to.try_send(message).is_ok();
+        self.lost += u64::from(!is_sent);
+        is_sent
+    }
 }
 
 #[derive(Debug)]
@@ -161,8 +180,14 @@ impl Viewers {
         let (to, messages) = mpsc::channel(MAX_MESSAGES);
         let number = state.next;
         state.next += 1;
-        let viewer =
-            Viewer { watched: Vec::new(), generation: 0, credits: CREDITS, questions: Vec::new(), to };
+        let viewer = Viewer {
+            watched: Vec::new(),
+            generation: 0,
+            credits: CREDITS,
+            questions: Vec::new(),
+            to,
+            lost: 0,
+        };
         state.viewers.insert(number, viewer);
         Some((Place { viewers: self.clone(), number }, messages))
     }

@@ -193,14 +193,16 @@ pub fn look_at(fs: &dyn Fs, dir: &Path) -> CatalogEntry {
     entry
 }
 
-/// Losses of an incomplete recording: how many sets, if any were counted, then its own words.
+/// Losses of an incomplete recording in its own words, or else how many sets were counted.
 fn losses(sets: u64, outcome: &Outcome) -> Vec<String> {
-    let count = (sets > 0).then(|| format!("{sets} sets were not recorded"));
-    let mut words: Vec<_> = count.into_iter().chain(outcome.lost.iter().cloned()).collect();
-    if words.is_empty() {
-        words.push("the recording is not complete and does not say why".to_owned());
+    if !outcome.lost.is_empty() {
+        return outcome.lost.clone();
     }
-    words
+    vec![if sets > 0 {
+        format!("{sets} sets were not recorded")
+    } else {
+        "the recording is not complete and does not say why".to_owned()
+    }]
 }
 
 /// Sets, times and state of the segments.

@@ -421,7 +421,7 @@ def test_a_killed_daemon_closes_and_the_next_one_has_another_token(binary: str, 
     text = RIG.format(name="killed", port='"off"') + SIMULATED.format(name="front")
     (tmp_path / "rig.toml").write_text(text)
     port = free_port()
-    start = ("run", str(tmp_path / "rig.toml"), "-q", "--foxglove", str(port))
+    start = ("run", str(tmp_path / "rig.toml"), "-q", f"--foxglove={port}")
     image = "/killed/front/depth/image_raw"
     with running(binary, runtime, tmp_path / "log", *start, codes=CODES) as daemon:
         url = address(binary, runtime, "killed")
@@ -533,7 +533,7 @@ def test_the_layout_is_one_of_the_default_rig(binary: str, runtime: Path, tmp_pa
     default = command(binary, runtime, "config", "show")
     cheap = re.sub(r"^model = ", "cheap = true\nmodel = ", default, flags=re.MULTILINE)
     (tmp_path / "rig.toml").write_text(cheap)
-    start = ("run", str(tmp_path / "rig.toml"), "-q", "--foxglove", str(free_port()))
+    start = ("run", str(tmp_path / "rig.toml"), "-q", f"--foxglove={free_port()}")
     with (
         running(binary, runtime, tmp_path / "log", *start, codes=CODES),
         viewer(address(binary, runtime, "mount")) as connected,

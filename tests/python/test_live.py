@@ -134,10 +134,16 @@ class Rig:
         connection.request("GET", path, headers=headers)
         return connection.getresponse()
 
-    def has_thread(self) -> bool:
-        """Whether the daemon has the thread that encodes."""
+    def thread(self) -> Path | None:
+        """The daemon's thread that encodes."""
         names = Path(f"/proc/{self.process_id}/task").glob("*/comm")
-        return any(name.read_text().strip() == "viewers" for name in names)
+        return next((name.parent for name in names if name.read_text().strip() == "viewers"), None)
+
+    def encoding_ns(self) -> int:
+        """The CPU time of that thread."""
+        thread = self.thread()
+        assert thread is not None
+        return int((thread / "schedstat").read_text().split()[0])
 
 
 @pytest.fixture(scope="module")
@@ -331,19 +337,41 @@ def test_numbers_come_at_most_five_times_a_second_and_only_if_asked_for(rig: Rig
 def test_nothing_is_encoded_when_nobody_watches(rig: Rig) -> None:
     with rig.page(WALL) as page:
         page.image()
-        assert rig.has_thread()
+        assert rig.thread()
         page.watch([])
         until = time.monotonic() + WAIT_S
-        while rig.has_thread():
+        while rig.thread():
             assert time.monotonic() < until
             time.sleep(0.05)
         page.watch(WALL)
         while page.image().generation != 3:
             pass
     until = time.monotonic() + WAIT_S
-    while rig.has_thread():
+    while rig.thread():
         assert time.monotonic() < until
         time.sleep(0.05)
+
+
+def test_a_second_page_costs_next_to_nothing(rig: Rig) -> None:
+    """Encoded is once for both; when it was twice, the second cost as much as the first."""
+    images = 40
+
+    def cost(*pages: Page) -> float:
+        before = rig.encoding_ns()
+        for _ in range(images):
+            for page in pages:
+                page.image()
+        return (rig.encoding_ns() - before) / images
+
+    ratios = []
+    with rig.page(WALL) as first:
+        first.image()
+        for _ in range(4):
+            alone = cost(first)
+            with rig.page(WALL) as second:
+                second.image()
+                ratios.append(cost(first, second) / alone)
+    assert min(ratios) < 1.5, ratios
 
 
 def test_a_page_that_never_reads_costs_no_memory_and_nobody_else(rig: Rig) -> None:

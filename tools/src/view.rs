@@ -8,6 +8,7 @@ use depthrig_daemon::status::{
     CameraState, CameraStatus, PreparingStatus, RecordingStatus, RefineState, ReplayStatus, RigStatus,
     StreamStatus,
 };
+use depthrig_recorder::report::page;
 use std::collections::BTreeMap;
 
 /// Style of the output.
@@ -54,7 +55,7 @@ pub fn status(rig: &RigStatus, style: Style) -> String {
         format!(
             "sets    {} sent at {} Hz, {} incomplete; spread p50 {:.1}, p95 {:.1}, max {:.1} ms",
             rig.sets.sent,
-            rig.sets.nominal_hz,
+            page::number(rig.sets.nominal_hz),
             rig.sets.incomplete,
             rig.sets.spread_p50_ms,
             rig.sets.spread_p95_ms,

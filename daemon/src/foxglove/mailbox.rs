@@ -30,6 +30,8 @@ pub(super) struct Mailbox {
     /// Number of the newest ping.
     newest: u64,
     problems: VecDeque<String>,
+    /// Lines that found no room.
+    left_out: u64,
 }
 
 #[derive(Debug)]
@@ -87,9 +89,22 @@ impl Mailbox {
 
     /// Puts in a line for the client; the same line waits once.
     pub(super) fn put_problem(&mut self, problem: String) {
-        if self.problems.len() < PROBLEMS && !self.problems.contains(&problem) {
-            self.problems.push_back(problem);
+        if self.problems.contains(&problem) {
+            return;
         }
+        if self.problems.len() < PROBLEMS {
+            self.problems.push_back(problem);
+        } else {
+            self.left_out += 1;
+        }
+    }
+
+    /// The next line, the last of which says how many are missing.
+    fn problem(&mut self) -> Option<String> {
+        self.problems.pop_front().or_else(|| match core::mem::take(&mut self.left_out) {
+            0 => None,
+            n => Some(format!("{n} lines more were left out: they come faster than this viewer reads")),
+        })
     }
 
     /// The client has answered this ping, so it has read everything before.
@@ -108,7 +123,7 @@ impl Mailbox {
     /// The next thing to send: small messages go before images.
     pub(super) fn next(&mut self) -> Option<Next> {
         let number = self.newest + 1;
-        let content = if let Some(problem) = self.problems.pop_front() {
+        let content = if let Some(problem) = self.problem() {
             Content::Problem(problem)
         } else if !self.small.is_empty() && self.bundles.len() < BUNDLES {
             self.bundles.push(number);
@@ -208,5 +223,19 @@ mod tests {
         }
         assert_eq!(mailbox.next(), Some(Next { number: 2, content: Content::Problem("x".into()) }));
         assert_eq!(mailbox.next(), None);
+    }
+
+    #[test]
+    fn lines_without_room_are_counted_and_the_count_is_told() {
+        let mut mailbox = Mailbox::default();
+        for n in (0..PROBLEMS + 3).chain(0..2) {
+            mailbox.put_problem(n.to_string());
+        }
+        let mut lines = Vec::new();
+        while let Some(Next { content: Content::Problem(line), .. }) = mailbox.next() {
+            lines.push(line);
+        }
+        assert_eq!(lines.len(), PROBLEMS + 1);
+        assert!(lines[PROBLEMS].starts_with("3 lines more"), "{lines:?}");
     }
 }

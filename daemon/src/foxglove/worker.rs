@@ -2,9 +2,8 @@
 
 use super::scene::Scene;
 use super::{RATE_HZ, Shared, State, protocol};
-use crate::priority;
 use crate::rig::report;
-use crate::viewers::{Newest, next_turn};
+use crate::viewers::{Newest, next_turn, work_until_done};
 use core::time::Duration;
 use depthrig_bus::sync::lock;
 use depthrig_bus::{Bus, Frame, FrameHeader, HostTime, StreamId};
@@ -22,16 +21,13 @@ const DIAGNOSTICS_PERIOD: Duration = Duration::from_secs(1);
 
 /// Runs until nobody watches a channel.
 pub(super) fn run(shared: &Shared) {
-    priority::lower_current_thread();
-    match Bus::open(&shared.runtime, &shared.rig) {
-        Ok(bus) => Worker::new(bus).run(shared),
-        Err(e) => {
-            let mut state = lock(&shared.state);
-            for client in state.clients.values_mut() {
-                client.put_problem(e.to_string());
-            }
-            state.is_running = false;
+    let open = || Bus::open(&shared.runtime, &shared.rig);
+    if let Err(e) = work_until_done("foxglove", open, |bus| Worker::new(bus).run(shared)) {
+        let mut state = lock(&shared.state);
+        for client in state.clients.values_mut() {
+            client.put_problem(e.to_string());
         }
+        state.is_running = false;
     }
 }
 

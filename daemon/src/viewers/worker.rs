@@ -1,15 +1,14 @@
 //! The thread that encodes.
 
 use super::newest::{Newest, next_turn};
+use super::thread::work_until_done;
 use super::{Geometry, Head, Measured, Message, OfStream, Shared, State, Viewer, Watched, pixel};
-use crate::priority;
 use core::time::Duration;
 use depthrig_bus::sync::lock;
 use depthrig_bus::{Bus, HostTime, StreamId};
 use depthrig_recorder::preview::{Preview, measure, preview};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::PoisonError;
-use tokio::sync::mpsc::error::TrySendError;
 
 /// Pause between two looks at a stream whose next frame somebody waits for.
 const POLL: Duration = Duration::from_millis(5);
@@ -20,16 +19,13 @@ const IDLE: Duration = Duration::from_secs(1);
 
 /// Runs until nobody watches any stream.
 pub(super) fn run(shared: &Shared) {
-    priority::lower_current_thread();
-    match Bus::open(&shared.runtime, &shared.rig) {
-        Ok(bus) => Worker::new(bus).run(shared),
-        Err(e) => {
-            let mut state = lock(&shared.state);
-            for viewer in state.viewers.values() {
-                let _ = viewer.to.try_send(Message::Problem(e.to_string()));
-            }
-            state.is_running = false;
+    let open = || Bus::open(&shared.runtime, &shared.rig);
+    if let Err(e) = work_until_done("viewers", open, |bus| Worker::new(bus).run(shared)) {
+        let mut state = lock(&shared.state);
+        for viewer in state.viewers.values_mut() {
+            viewer.put(Message::Problem(e.to_string()));
         }
+        state.is_running = false;
     }
 }
 
@@ -119,9 +115,8 @@ impl Worker {
         drop(state);
         for (viewer, question) in questions {
             let answer = pixel::answer(question, self.newest.frames());
-            if let Some(viewer) = lock(&shared.state).viewers.get(&viewer) {
-                // One that does not read gets no answer.
-                let _ = viewer.to.try_send(Message::Pixel(answer));
+            if let Some(viewer) = lock(&shared.state).viewers.get_mut(&viewer) {
+                viewer.put(Message::Pixel(answer));
             }
         }
     }
@@ -188,10 +183,8 @@ impl Worker {
                 depth_unit_m: image.depth_unit_m,
                 generation,
             };
-            match viewer.to.try_send(Message::Image(head.message(&image.bytes))) {
-                Ok(()) => viewer.credits -= 1,
-                // It does not read, or has gone.
-                Err(TrySendError::Full(_) | TrySendError::Closed(_)) => {}
+            if viewer.put(Message::Image(head.message(&image.bytes))) {
+                viewer.credits -= 1;
             }
         }
     }
@@ -212,22 +205,22 @@ impl Worker {
     /// Sends what goes with an image: the geometry, when it is new to the viewer, and the numbers.
     fn describe(&self, viewer: &mut Viewer, job: &Job) {
         let Some(frame) = self.newest.frames().get(&job.id) else { return };
-        let Some(watched) = viewer.watched.get_mut(job.index) else { return };
+        let index = job.index;
         let geometry = Geometry::of(frame.header());
-        if watched.geometry != Some(geometry) {
+        if viewer.watched[index].geometry != Some(geometry) {
             let message = OfStream { stream: job.id.clone(), what: geometry };
-            if viewer.to.try_send(Message::Geometry(message.into())).is_ok() {
-                watched.geometry = Some(geometry);
+            if viewer.put(Message::Geometry(message.into())) {
+                viewer.watched[index].geometry = Some(geometry);
             }
         }
         let numbers = self.measured.get(&job.id).and_then(|m| m.measured.as_ref());
         if let Some(numbers) = numbers
-            && watched.measure
-            && watched.measured != Some(numbers.sequence)
+            && viewer.watched[index].measure
+            && viewer.watched[index].measured != Some(numbers.sequence)
         {
             let message = OfStream { stream: job.id.clone(), what: numbers.clone() };
-            if viewer.to.try_send(Message::Measure(message.into())).is_ok() {
-                watched.measured = Some(numbers.sequence);
+            if viewer.put(Message::Measure(message.into())) {
+                viewer.watched[index].measured = Some(numbers.sequence);
             }
         }
     }
@@ -251,9 +244,9 @@ fn pause(state: &State) -> Duration {
 
 /// Says to all who watch a stream why it is not shown.
 fn tell(shared: &Shared, id: &StreamId, why: &impl core::fmt::Display) {
-    for viewer in lock(&shared.state).viewers.values() {
+    for viewer in lock(&shared.state).viewers.values_mut() {
         if viewer.watched.iter().any(|w| w.id == *id) {
-            let _ = viewer.to.try_send(Message::Problem(format!("{id}: {why}")));
+            viewer.put(Message::Problem(format!("{id}: {why}")));
         }
     }
 }

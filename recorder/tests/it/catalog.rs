@@ -89,7 +89,7 @@ fn good_and_bad_ones_are_listed_with_the_reason() {
         ("no_session", Health::Damaged, 5, "session.toml is missing"),
         ("bad_session", Health::Damaged, 5, "session.toml cannot be read"),
         ("full", Health::Lost, 5, "the disk was full"),
-        ("lost", Health::Lost, 5, "2 sets were not recorded"),
+        ("lost", Health::Lost, 5, "2 of 7 sets were not recorded: disk_slow"),
         ("open", Health::Unfinished, 5, "depthrig recover"),
         ("part", Health::Unfinished, 4, "seg_0002.mcap.part was not finished: run depthrig recover"),
     ] {

@@ -48,7 +48,7 @@ pub struct RunArgs {
     #[arg(long, value_name = "N", value_parser = crate::args::positive_seconds)]
     seconds: Option<f64>,
     /// Serve Foxglove and Lichtblick on this loopback port [default without PORT: 8765]
-    #[arg(long, value_name = "PORT", num_args = 0..=1, default_missing_value = "8765")]
+    #[arg(long, value_name = "PORT", num_args = 0..=1, default_missing_value = "8765", require_equals = true)]
     foxglove: Option<u16>,
     /// Print the summary as JSON at the end
     #[arg(long)]
