@@ -4,7 +4,7 @@
 Seven simulated cameras, fourteen streams of 1280x720 at 30 Hz, recorded at 5 Hz. In turns nobody looks, one program reads what a page reads (every stream
 640 columns wide at 10 Hz), two do, and a program without any connection works as much as one of those did: on a computer with few cores that alone delays
 the cameras. Of each turn it prints the cores of the daemon's threads, the age of the images, and the time from capture to the channel of the recorded
-frames; then the first paint of the page in Chromium. Ratios are within the run.
+frames; then, in Chromium, the first paint of the page and the age of its images when they are drawn. Ratios are within the run.
 """
 
 from __future__ import annotations
@@ -100,24 +100,57 @@ def quantile(values: list[float], q: float) -> float:
     return sorted(values)[min(len(values) - 1, int(q * len(values)))] if values else float("nan")
 
 
-def first_paint(url: str, token: str) -> float | None:
-    """Seconds from the start of loading to the first paint with content, median of five."""
+# Of each image the page was sent: its age when it was sent, and from its arrival until its credit was given back, which the page does when it has drawn it.
+WATCHED_SOCKET = """
+window.ages = [];
+const Plain = WebSocket;
+window.WebSocket = class extends Plain {
+  constructor(...args) {
+    super(...args);
+    const waiting = [];
+    this.addEventListener("message", ({ data }) => {
+      if (data instanceof ArrayBuffer) {
+        waiting.push([Number(new DataView(data).getBigInt64(32, true)) / 1e6, performance.now()]);
+      }
+    });
+    const send = this.send.bind(this);
+    this.send = (text) => {
+      send(text);
+      for (let n = JSON.parse(text).credit ?? 0; n > 0 && waiting.length > 0; n -= 1) {
+        const [age, came] = waiting.shift();
+        window.ages.push(age + performance.now() - came);
+      }
+    };
+  }
+};
+"""
+
+
+def in_chromium(url: str, token: str, seconds: float) -> dict[str, object]:
+    """Seconds from the start of loading to the first paint with content, and the age of images when they are drawn."""
     chromium = shutil.which("chromium")
     if chromium is None:
-        return None
+        return {}
     from playwright.sync_api import sync_playwright
 
     times = []
     with sync_playwright() as p:
         browser = p.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         for _ in range(5):
-            page = browser.new_page()
+            page = browser.new_page(viewport={"width": 1600, "height": 1000})
+            page.add_init_script(WATCHED_SOCKET)
             page.goto(f"{url}#token={token}")
             page.wait_for_function("performance.getEntriesByName('first-contentful-paint').length > 0")
-            times.append(page.evaluate("performance.getEntriesByName('first-contentful-paint')[0].startTime"))
+            times.append(page.evaluate("performance.getEntriesByName('first-contentful-paint')[0].startTime") / 1000)
+            if len(times) == 5:
+                page.wait_for_timeout(3000)
+                page.evaluate("window.ages.length = 0")
+                page.wait_for_timeout(1000 * seconds)
+                ages = page.evaluate("window.ages")
             page.close()
         browser.close()
-    return statistics.median(times) / 1000
+    drawn = {"drawn_age_ms": [quantile(ages, q) for q in (0.5, 0.99)], "drawn_per_second": len(ages) / seconds}
+    return {"first_paint_s": statistics.median(times), **drawn}
 
 
 def main() -> int:
@@ -189,13 +222,13 @@ def measure(args: argparse.Namespace, folder: Path, daemon: subprocess.Popen[byt
         share = min(1.0, busy + sum(cores["one page"][-1].get(t, 0) for t in THREADS))
         turn("other work", work, 1)
         time.sleep(1)
-    paint = first_paint(url, token)
+    chromium = in_chromium(url, token, args.seconds)
     daemon.send_signal(signal.SIGINT)
     daemon.wait(60)
     (dataset,) = (p.parent for p in (folder / "data").rglob("session.toml"))
     frames = [json.loads(line) for line in ask(args.depthrig, "cat", str(dataset), "--json").splitlines()]
     sets = {f["set"] for f in frames}
-    report: dict[str, object] = {"cores": os.cpu_count(), "load": os.getloadavg()[0], "first_paint_s": paint}
+    report: dict[str, object] = {"cores": os.cpu_count(), "load": os.getloadavg()[0], "chromium": chromium}
     report["sets"] = len(sets)
     report["frames_missing"] = len(sets) * len(WATCH) - len(frames)
     for name, spans in turns.items():

@@ -255,6 +255,13 @@ def test_a_control_takes_effect_at_once_and_reaches_the_file_only_when_confirmed
     command(binary, runtime, "config", "check", str(rig.file))
     assert rig.ask("GET", "/v1/controls/changes")["diff"] == ""
     assert camera_controls(rig, "front")["controls"][0]["in_file"] == 64
+    # A value that is there already changes between its spaces and its comment.
+    rig.file.write_text(after.replace("gain = 64\n", "gain   = 64  # for the lamps\n"))
+    rig.ask("POST", "/v1/controls", {"camera": "front", "name": "gain", "value": 80})
+    changes = rig.ask("GET", "/v1/controls/changes")
+    rig.ask("POST", "/v1/controls/save", {"fingerprint": changes["fingerprint"]})
+    assert rig.file.read_text() == after.replace("gain = 64\n", "gain   = 80  # for the lamps\n")
+    rig.file.write_text(after)
     # Back to the file, and without a value there back to what it is after power-on.
     rig.ask("POST", "/v1/controls", {"camera": "front", "name": "gain", "value": 32})
     assert rig.ask("POST", "/v1/controls/revert", {"camera": "front"})["controls"][0]["value"] == 64

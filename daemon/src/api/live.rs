@@ -31,6 +31,9 @@ const MAX_MESSAGE_BYTES: usize = 16 << 10;
 const SILENCE: Duration = Duration::from_secs(20);
 const PING_PERIOD: Duration = Duration::from_secs(5);
 
+/// What a control frame holds beside its code (RFC 6455).
+const MAX_REASON_BYTES: usize = 123;
+
 /// Reasons for which the server closes; 4000 and more are an application's own (RFC 6455).
 mod code {
     pub(super) const STOPPED: u16 = 1001;
@@ -158,10 +161,11 @@ async fn serve(mut socket: WebSocket, rig: Arc<dyn Control>, live: Live, asked: 
         Ok(client) => client.serve(&mut socket, live.stopped).await,
         Err(end) => Some(end),
     };
-    if let Some(End { code, reason }) = end {
-        // A reason longer than a control frame takes is cut off, at a character.
-        let reason: String = reason.chars().take(40).collect::<String>()
-            + if reason.chars().count() > 40 { "…" } else { "" };
+    if let Some(End { code, mut reason }) = end {
+        if reason.len() > MAX_REASON_BYTES {
+            reason.truncate(reason.floor_char_boundary(MAX_REASON_BYTES - '…'.len_utf8()));
+            reason.push('…');
+        }
         let _ = socket.send(Frame::Close(Some(CloseFrame { code, reason: reason.into() }))).await;
     }
 }

@@ -113,6 +113,22 @@ fn running_controls(checks: &mut Checks, node: &Node) -> anyhow::Result<()> {
     let refused = panel.set("controls.brightness", &ControlValue::Integer(256));
     checks.that("a value out of range is refused while it runs", refused.is_err(), "");
     checks.that("so is an unknown key", panel.set("brightness", &ControlValue::Integer(1)).is_err(), "");
+    // A switch and a menu, read by other code than ours.
+    let witness = v4l::Device::with_path(node.path())?;
+    for (key, value, raw) in [
+        ("controls.horizontal_flip", ControlValue::Boolean(true), v4l::control::Value::Boolean(true)),
+        ("controls.osd_text_mode", ControlValue::Item("None".into()), v4l::control::Value::Integer(2)),
+    ] {
+        let state = listed.iter().find(|c| c.key == key).context(key)?;
+        panel.set(key, &value)?;
+        let now = panel.list()?.into_iter().find(|c| c.key == key).context(key)?;
+        checks.equal(&format!("{key} has its value of a rig file"), now.file_value(), Some(value));
+        checks.equal(&format!("{key} as v4l reads it"), witness.control(state.control.id)?.value, raw);
+        let before = state.file_value().context(key)?;
+        panel.set(key, &before)?;
+        let now = panel.list()?.into_iter().find(|c| c.key == key).context(key)?;
+        checks.equal(&format!("{key} goes back"), now.file_value(), Some(before));
+    }
     let before = tally.of(0).count();
     tally.poll_for(stream.as_mut(), Duration::from_millis(300))?;
     checks.that("it streams on", tally.of(0).count() > before, before);
