@@ -12,22 +12,23 @@
 mod assembly;
 mod control;
 mod controls;
+mod inner;
 mod join;
 mod motion;
 pub(crate) mod report;
+mod threads;
 
 use crate::api::{self, ServerHandle};
-use crate::camera::{Camera, Shared, Supervisor};
+use crate::camera::{Camera, Shared};
 use crate::config::RigConfig;
 use crate::control::{Control, Shows};
 use crate::family::Preparation;
-use crate::housekeeping::Housekeeping;
-use crate::recording::{Outside, Recording, Reports, StreamFacts, recover_left};
+use crate::recording::{Outside, Recording, Reports, recover_left};
 use crate::sets::SpreadStats;
 use crate::stage::{Intake, Stage};
 use crate::status::{CameraState, RigStatus, SetAccount};
 use crate::wake::Wake;
-use crate::{Error, ErrorKind, Result, priority};
+use crate::{Error, Result, priority};
 use assembly::Assembly;
 use core::time::Duration;
 use depthrig_bus::runtime::{RigLock, RuntimeDir};
@@ -42,17 +43,14 @@ use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard};
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
+use threads::{housekeeping, start_thread, supervise};
 
-/// How often the supervisors look at their cameras.
-const STEP: Duration = Duration::from_millis(20);
 /// How long the start waits for cameras that answer slowly; they come in later all the same.
 const START_TIMEOUT: Duration = Duration::from_secs(10);
 /// How long a recovery of old datasets gets to end; cut off it begins anew at the next start.
 const RECOVER_TIMEOUT: Duration = Duration::from_secs(2);
-/// How long one camera thread gets to end; with it the whole stop stays below a second.
-const STOP_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// Set to end a thread.
 type StopFlag = Arc<AtomicBool>;
@@ -165,8 +163,8 @@ impl Rig {
     /// Starts the rig and returns when every camera streams or is known not to, after 10 s at most.
     ///
     /// # Errors
-    /// [`ErrorKind::InUse`] naming who runs a rig of this name, [`ErrorKind::NoSpace`] when `/dev/shm` is too
-    /// small, [`ErrorKind::BadInput`] when a camera's settings cannot work (all such cameras are named).
+    /// [`crate::ErrorKind::InUse`] naming who runs a rig of this name, [`crate::ErrorKind::NoSpace`] when `/dev/shm` is too
+    /// small, [`crate::ErrorKind::BadInput`] when a camera's settings cannot work (all such cameras are named).
     pub fn start(mut config: RigConfig, options: &RigOptions) -> Result<Self> {
         priority::raise_file_limit();
         umask::check();
@@ -391,104 +389,12 @@ impl Drop for Rig {
     }
 }
 
-impl Inner {
-    fn drawing(&self) -> Option<DrawingProgress> {
-        self.shared.drawing.as_ref()?.progress()
-    }
-
-    /// Refuses while simulated cameras show coarse images: a dataset of them would look like a broken one.
-    fn must_be_drawn(&self) -> Result<()> {
-        let Some(DrawingProgress { done, total, error }) = self.drawing() else { return Ok(()) };
-        let cure = match error {
-            Some(e) => e,
-            None => format!(
-                "{} % are done; try again when `depthrig status` no longer reports `preparing`",
-                100 * done / total
-            ),
-        };
-        let what =
-            format!("the images of simulated cameras are still being rendered and coarse until then: {cure}");
-        Err(Error::new(ErrorKind::WrongState, what))
-    }
-
-    fn spreads(&self) -> MutexGuard<'_, SpreadStats> {
-        lock(&self.spreads)
-    }
-
-    fn recording(&self) -> MutexGuard<'_, Recording> {
-        lock(&self.recording)
-    }
-
-    fn set_accounts(&self) -> MutexGuard<'_, SetAccounts> {
-        lock(&self.set_accounts)
-    }
-
-    /// Waits until the sets that wait for refined depth are with the recorder.
-    fn finish_held(&self) {
-        self.closing.store(true, Ordering::Relaxed);
-        let deadline = HostTime::now().plus(join::TIMEOUT);
-        while self.held_sets.load(Ordering::Relaxed) > 0 && !deadline.from_now().is_zero() {
-            std::thread::sleep(Duration::from_millis(5));
-        }
-    }
-
-    fn all_done(&self) -> bool {
-        self.cameras.iter().all(|c| matches!(c.state().phase, CameraState::Finished | CameraState::Failed))
-    }
-
-    fn stream_facts(&self) -> Vec<StreamFacts> {
-        let mut facts = Vec::new();
-        for camera in &self.cameras {
-            let state = camera.state();
-            let Some(info) = &state.info else { continue };
-            facts.extend(state.all_streams().map(|stream| {
-                let mut calibration = info.calibration.clone();
-                if stream.profile.format.is_motion() && !info.motion.is_empty() {
-                    calibration = format!("{calibration}; {}", info.motion);
-                }
-                let correction = camera.config.refined_correction();
-                if let Some(correction) = correction.filter(|_| is_refined(&stream.id)) {
-                    calibration = format!("{calibration}; {correction}");
-                }
-                StreamFacts {
-                    stream: Arc::clone(stream),
-                    model: info.model.clone(),
-                    serial: info.serial.clone(),
-                    firmware: info.firmware.clone(),
-                    calibration,
-                    camera_pose: state.pose,
-                    computed: camera.computed(&stream.id),
-                }
-            }));
-        }
-        facts
-    }
-}
-
-/// Whether the refine stage makes the stream.
-fn is_refined(id: &StreamId) -> bool {
-    [depthrig_cdm::stage::REFINED, depthrig_cdm::stage::ALIGNED].contains(&id.stream.as_str())
-}
-
 /// Adds the scenes of all cameras to the shared drawing.
 fn plan(config: &RigConfig, drawing: &Drawing) -> Result<()> {
     for camera in &config.cameras {
         camera.backend.add_to_drawing(drawing)?;
     }
     Ok(())
-}
-
-fn start_thread(
-    name: &str,
-    run: impl FnOnce(&AtomicBool) + Send + 'static,
-) -> Result<(JoinHandle<()>, StopFlag)> {
-    let stop = StopFlag::default();
-    let theirs = Arc::clone(&stop);
-    let thread = std::thread::Builder::new().name(name.to_owned()).spawn(move || run(&theirs));
-    let thread = thread.map_err(|e| {
-        Error::new(ErrorKind::Other, format!("the {name} thread could not be started")).with_source(e)
-    })?;
-    Ok((thread, stop))
 }
 
 /// Prepares every camera; scenes are rendered now unless that is to be done while they stream.
@@ -507,35 +413,4 @@ fn prepare(config: &mut RigConfig, options: &RigOptions) -> Result<()> {
         })?;
     }
     Ok(())
-}
-
-/// The supervisor thread.
-fn supervise(inner: &Arc<Inner>, stop: &AtomicBool) {
-    let supervisor = |c: &Arc<Camera>| Supervisor::new(Arc::clone(c), Arc::clone(&inner.shared));
-    let mut supervisors: Vec<_> = inner.cameras.iter().map(supervisor).collect();
-    while !stop.load(Ordering::Relaxed) {
-        let now = HostTime::now();
-        for s in &mut supervisors {
-            s.step(now);
-        }
-        std::thread::sleep(STEP);
-    }
-    for s in &supervisors {
-        s.request_stop();
-    }
-    let deadline = HostTime::now().plus(STOP_TIMEOUT);
-    for s in &mut supervisors {
-        s.stop(deadline.from_now());
-    }
-}
-
-/// Periodic housekeeping, on a thread of its own.
-fn housekeeping(inner: &Inner, stop: &AtomicBool) {
-    let housekeeping = Housekeeping {
-        recording: &inner.recording,
-        reports: &inner.reports,
-        bus: &inner.shared.bus,
-        cpu_millicores: &inner.cpu_millicores,
-    };
-    housekeeping.run(|| stop.load(Ordering::Relaxed), || report::diagnostics(&report::status(inner)));
 }
