@@ -45,7 +45,7 @@ HOLE = Patch(0.75, 0.75, (128, 128, 128), 0)
 PATCHES = (NEAR, FAR, MIDDLE, HOLE)
 
 MANIFEST = """model = "pattern"
-rate_hz = 10.0
+rate_hz = {rate_hz}
 """
 STREAM = """
 [[stream]]
@@ -86,21 +86,21 @@ rate_hz = 15.0
 """
 
 
-def pattern(folder: Path) -> Path:
+def pattern(folder: Path, width: int = WIDTH, height: int = HEIGHT, rate_hz: float = 10.0) -> Path:
     """A camera of four patches, as a manifest of the backend `files`."""
     folder.mkdir()
-    color = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    depth = np.zeros((HEIGHT, WIDTH), np.uint16)
+    color = np.zeros((height, width, 3), np.uint8)
+    depth = np.zeros((height, width), np.uint16)
     for patch in PATCHES:
-        rows = slice(0, HEIGHT // 2) if patch.y < 0.5 else slice(HEIGHT // 2, HEIGHT)
-        columns = slice(0, WIDTH // 2) if patch.x < 0.5 else slice(WIDTH // 2, WIDTH)
+        rows = slice(0, height // 2) if patch.y < 0.5 else slice(height // 2, height)
+        columns = slice(0, width // 2) if patch.x < 0.5 else slice(width // 2, width)
         color[rows, columns] = patch.color
         depth[rows, columns] = patch.depth_mm
     Image.fromarray(color).save(folder / "color_1.png")
     Image.fromarray(depth).save(folder / "depth_1.png")
     manifest = folder / "camera.toml"
     streams = STREAM.format(name="color", more="") + STREAM.format(name="depth", more="depth_unit_m = 0.001\n")
-    manifest.write_text(MANIFEST + streams)
+    manifest.write_text(MANIFEST.format(rate_hz=rate_hz) + streams)
     return manifest
 
 
