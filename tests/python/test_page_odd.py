@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from page import CHROMIUM, FAR, MIDDLE, NEAR, RIG, Address, address, blank, files_camera, free_port, opened, pattern, until
+from page import CHROMIUM, FAR, HOLE, MIDDLE, NEAR, RIG, Address, address, blank, files_camera, free_port, opened, pattern, until
 from playwright.sync_api import Browser, Route, WebSocketRoute
 from test_daemon import WAIT_S, binary, running, runtime
 from test_page import CODES, browser, millimetres, near
@@ -91,7 +91,7 @@ def test_a_stream_whose_size_changes_is_drawn_in_its_new_size(browser: Browser, 
     sizes = {"width": 0, "height": 0}
 
     def resized(message: str | bytes) -> str | bytes:
-        """Depth of the ordinary camera as another one: of the size asked for, all of it 777 mm."""
+        """Depth of the ordinary camera as another one: of the size asked for, its right half farther away."""
         if isinstance(message, str) or sizes["width"] == 0:
             return message
         head = list(HEAD.unpack(message[: HEAD.size]))
@@ -99,7 +99,9 @@ def test_a_stream_whose_size_changes_is_drawn_in_its_new_size(browser: Browser, 
             return message
         columns, rows = sizes["width"], sizes["height"]
         head[4:9] = [1, columns, rows, columns, rows]
-        return HEAD.pack(*head) + np.full((rows, columns), 777, "<u2").tobytes()
+        depth = np.full((rows, columns), 777, "<u2")
+        depth[:, (columns + 1) // 2 :] = 2500
+        return HEAD.pack(*head) + depth.tobytes()
 
     with blank(browser, rig.origin) as wall:
         wall.page.route_web_socket(SOCKET, through(resized))
@@ -115,9 +117,10 @@ def test_a_stream_whose_size_changes_is_drawn_in_its_new_size(browser: Browser, 
                 rows,
             )
             wall.wait_for_image("still/depth")
-            # The image is of one depth, so of one colour from edge to edge.
-            colors = wall.colors("still/depth", NEAR, FAR, MIDDLE)
-            assert colors[0] == colors[1] == colors[2]
+            # Each half has one colour from its upper to its lower end.
+            above_left, above_right, left, right = wall.colors("still/depth", NEAR, FAR, MIDDLE, HOLE)
+            assert (above_left, above_right) == (left, right)
+            assert (left == right) == (columns == 1)
 
 
 def test_a_page_that_missed_a_start_says_so_and_stops_nothing(browser: Browser, rig: Address) -> None:
