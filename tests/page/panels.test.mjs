@@ -75,10 +75,11 @@ test("the address of a dataset holds any name", () => {
 });
 
 test("losses say what to do, sets before frames, the most frequent reason first", () => {
-  assert.match(lossAdvice({ disk_slow: 1, encoder_busy: 3 }, { device_gap: 99 }), /encodes too slowly/);
-  assert.match(lossAdvice({}, { device_gap: 9, no_slot: 1 }), /USB/);
-  assert.equal(lossAdvice({ disk_slow: 0 }, {}), "");
-  assert.match(lossAdvice({ weather: 1 }, {}), /log/);
+  assert.match(lossAdvice({ disk_slow: 1, encoder_busy: 3 }, {}, { device_gap: 99 }), /encodes too slowly/);
+  assert.match(lossAdvice({}, { "a/color": 4 }, { device_gap: 9, no_slot: 1 }), /USB/);
+  assert.equal(lossAdvice({ disk_slow: 0 }, {}, {}), "");
+  assert.match(lossAdvice({}, { "a/color": 1, "b/color": 2 }, {}), /b\/color/);
+  assert.match(lossAdvice({ weather: 1 }, {}, {}), /log/);
 });
 
 test("a rig is ready when every stream comes", () => {
