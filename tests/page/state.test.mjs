@@ -61,7 +61,7 @@ const key = (name, more = {}) => ({ key: name, repeat: false, ctrlKey: false, al
 const nowhere = { isText: false, takesSpace: false, takesEnter: false, takesArrows: false, takesLetters: false, isInDialog: false };
 
 test("keys do nothing in text fields and dialogs, nor with modifiers", () => {
-  for (const name of [" ", "n", "1", "?", "Escape", "ArrowLeft", "p", "r", "b", "G", "m", "l", "y", "d", "c", "k"]) {
+  for (const name of [" ", "n", "1", "?", "Escape", "ArrowLeft", "p", "r", "b", "G", "m", "l", "y", "d", "c", "k", "a", "o", "v"]) {
     assert.notEqual(actionOf(key(name), nowhere), null, name);
     assert.equal(actionOf(key(name), { ...nowhere, isText: true }), null, name);
     assert.equal(actionOf(key(name), { ...nowhere, isInDialog: true }), null, name);
