@@ -34,7 +34,7 @@ macro_rules! files {
 }
 
 /// The files in the folder `page`.
-pub(super) static FILES: [File; 82] = files![
+pub(super) static FILES: [File; 84] = files![
     "advice.js" "aids.js" "aidsdepth.js" "aidsimage.js" "aidsoverlay.js" "api.js" "boardoverlay.js"
     "calibrationpanel.js" "calibrationtext.js" "cloudbar.js" "cloudgl.js" "cloudhints.js"
     "cloudinput.js" "cloudlabels.js" "cloudscene.js" "cloudshaders.js" "cloudsource.js"
@@ -46,8 +46,8 @@ pub(super) static FILES: [File; 82] = files![
     "plane.js" "protocol.js" "range.js" "ready.js" "recordbar.js" "recording.js" "recordingrow.js"
     "recordings.js" "recordingtext.js" "recordtext.js" "reference.js" "referencetext.js"
     "replaybar.js" "savedialog.js" "scenes.js" "shift.js" "skew.js" "slot.js" "sound.js" "style.css"
-    "syncpanel.js" "takes.js" "thinning.js" "tile.js" "tilestate.js" "types.js" "usbtree.js"
-    "view.css" "wall.js" "watch.js" "wipeline.js" "words.js"
+    "syncpanel.js" "takes.js" "thinning.js" "tile.js" "tilestate.js" "types.js" "uncertaintymap.js"
+    "uncertaintytext.js" "usbtree.js" "view.css" "wall.js" "watch.js" "wipeline.js" "words.js"
 ];
 
 /// Where reports are, each below an address of its own: a tab that is opened cannot send the token.
