@@ -35,11 +35,15 @@ function mostFrequent(losses) {
  * One sentence about the most frequent reason, that of sets first: a set that is lost is missing from the dataset.
  *
  * @param {Losses} sets
+ * @param {Losses} missing by stream
  * @param {Losses} frames
  */
-export function lossAdvice(sets, frames) {
+export function lossAdvice(sets, missing, frames) {
   if (total(sets) > 0) {
     return SET_ADVICE[mostFrequent(sets)] ?? "The daemon's log says why.";
   }
-  return total(frames) > 0 ? (FRAME_ADVICE[mostFrequent(frames)] ?? "The daemon's log says why.") : "";
+  if (total(frames) > 0) {
+    return FRAME_ADVICE[mostFrequent(frames)] ?? "The daemon's log says why.";
+  }
+  return total(missing) > 0 ? `Sets lack images of ${mostFrequent(missing)}: its tile and doctor (D) show how it is.` : "";
 }

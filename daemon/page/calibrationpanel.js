@@ -1,13 +1,15 @@
 /** The panel of the calibration: the present one, and the capture of views while one runs. */
 
-import { getStream, messageOf } from "./api.js";
+import { get, getStream, messageOf } from "./api.js";
 import { BoardOverlay } from "./boardoverlay.js";
 import { ageText, coverageText, stateText } from "./calibrationtext.js";
 import { announce, make, makeText, setState, setText } from "./dom.js";
 import { EventParser } from "./eventstream.js";
+import { uncertaintyMap } from "./uncertaintymap.js";
 
 /** @typedef {import("./types.js").Status} Status */
 /** @typedef {import("./paneltypes.js").CaptureEvent} CaptureEvent */
+/** @typedef {import("./paneltypes.js").CalibratedImage} CalibratedImage */
 
 const AGAIN_MS = 2000;
 /** A capture that says nothing for so long has ended without a word. */
@@ -25,6 +27,12 @@ export class CalibrationPanel {
   #silence = 0;
   #shown = "";
   #state = "";
+  /** @type {CalibratedImage[]} */
+  #images = [];
+  /** Why there are none; empty if they were read. */
+  #withoutMaps = "";
+  /** @type {Status | null} */
+  #status = null;
 
   /** @param {ReadonlyMap<string, import("./tile.js").Tile>} tiles */
   constructor(tiles) {
@@ -38,6 +46,21 @@ export class CalibrationPanel {
   open() {
     this.#following = new AbortController();
     void this.#follow(this.#following.signal);
+    void this.#readMaps();
+  }
+
+  /** The calibration in use stays the same while the rig runs. */
+  async #readMaps() {
+    this.#withoutMaps = "";
+    try {
+      this.#images = /** @type {CalibratedImage[]} */ (await get("/v1/calibration"));
+    } catch (error) {
+      this.#withoutMaps = `The map of uncertainty was not read: ${messageOf(error)}`;
+    }
+    this.#shown = "";
+    if (this.#status !== null) {
+      this.update(this.#status);
+    }
   }
 
   close() {
@@ -123,6 +146,7 @@ export class CalibrationPanel {
 
   /** @param {Status} status */
   update(status) {
+    this.#status = status;
     const cameras = status.cameras.map(({ name, mount }) => ({ name, mount: mount ?? null }));
     const shown = JSON.stringify(cameras);
     if (shown === this.#shown) {
@@ -141,8 +165,10 @@ export class CalibrationPanel {
         setState(box, mount.warnings.length > 0 ? "warning" : "good");
         box.append(makeText("p", "", `${ageText(mount)}: ${mount.worth}`));
         box.append(...mount.warnings.map((warning) => makeText("p", "why", warning)));
+        box.append(...this.#images.filter(({ stream }) => stream.startsWith(`${name}/`)).map(uncertaintyMap));
         return box;
       }),
+      makeText("p", "why", this.#withoutMaps),
     );
   }
 }

@@ -11,7 +11,7 @@
  * @property {boolean} takesLetters letters choose in it
  * @property {boolean} isInDialog
  *
- * @typedef {{action: "toggleRecord" | "note" | "back" | "help" | "enlarge" | "playPause" | "cloud" | "aids"}
+ * @typedef {{action: "toggleRecord" | "note" | "back" | "help" | "enlarge" | "playPause" | "cloud" | "aids" | "reference"}
  *   | {action: "redo" | "bad" | "good" | "mark"} | {action: "panel", panel: PanelName}
  *   | {action: "step", sets: number} | {action: "camera", n: number}} KeyAction
  */
@@ -26,6 +26,7 @@ const LETTERS = {
   m: { action: "mark" },
   v: { action: "cloud" },
   a: { action: "aids" },
+  o: { action: "reference" },
   l: { action: "panel", panel: "recordings" },
   y: { action: "panel", panel: "sync" },
   d: { action: "panel", panel: "doctor" },

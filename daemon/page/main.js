@@ -2,7 +2,6 @@
 
 import { Aids } from "./aids.js";
 import { takeToken } from "./api.js";
-import { Blend } from "./blend.js";
 import { CloudView } from "./cloudview.js";
 import { Connection } from "./connection.js";
 import { addressOf, datasetOf } from "./dataset.js";
@@ -11,6 +10,7 @@ import { Hover } from "./hover.js";
 import { actionOf, keyTarget } from "./keys.js";
 import { TileLabels } from "./labels.js";
 import { LiveStatus } from "./livestatus.js";
+import { mixings } from "./mixture.js";
 import { Panels } from "./panels.js";
 import { PROTOCOL } from "./protocol.js";
 import { DepthRange } from "./range.js";
@@ -19,6 +19,7 @@ import { ReplayBar } from "./replaybar.js";
 import { play, setUpSound } from "./sound.js";
 import { Takes } from "./takes.js";
 import { Wall } from "./wall.js";
+import { WipeLine } from "./wipeline.js";
 
 /** @typedef {import("./types.js").Status} Status */
 /** @typedef {import("./types.js").Hello} Hello */
@@ -45,20 +46,28 @@ const range = new DepthRange(() => {
   wall.redrawAll((tile) => tile.isDepth || tile === wall.enlarged);
   cloud.redraw();
 });
-const blend = new Blend(() => {
-  wall.redrawAll((tile) => tile === wall.enlarged);
-  wall.askWatch();
-});
+const mixing = mixings(
+  () => wall.tiles.values(),
+  geometries,
+  () => {
+    wall.redrawAll((tile) => tile === wall.enlarged);
+    wall.askWatch();
+  },
+);
+const wipeLine = new WipeLine(mixing.wipe);
 const wall = new Wall({
   watch: (watched) => connection.watch(watched),
   tables: range.tables,
   onEnlarged: (tile) => {
-    blend.enlarged(wall.tiles.values(), tile);
+    mixing.enlarged(tile);
+    wipeLine.enlarged(tile);
     aids.enlarged(tile);
+    hasReference.hidden = tile === null || tile.isDepth;
+    reference?.enlarged(tile);
     // Marks were set for tiles of another size.
     hover.hide();
   },
-  blendOf: (tile) => blend.of(tile),
+  mixtureOf: (tile) => mixing.of(tile),
   onDrawn: (tile, ageMs) => {
     debug.drawn += 1;
     debug.ages.push(ageMs);
@@ -67,6 +76,7 @@ const wall = new Wall({
     }
     labels.drawn(tile, ageMs);
     aids.drawn(tile);
+    reference?.drawn(tile);
   },
   isMeasured: () => aids.isShown,
   watchInstead: () => cloud.watch(),
@@ -91,6 +101,9 @@ Object.assign(debug, { view: cloud.facts, aids });
 const labels = new TileLabels(wall);
 const hover = new Hover(wall.tiles, (id, place) => connection.askPixel(id, place));
 const recordBar = new RecordBar();
+const hasReference = byId("show-reference", HTMLButtonElement);
+/** @type {import("./reference.js").Reference | null} `null` before it is asked for first */
+let reference = null;
 /** @type {import("./recordings.js").Recordings | null} `null` before its panel is opened first */
 let recordings = null;
 const takes = new Takes(recordBar, (entry) => recordings?.marked(entry));
@@ -123,6 +136,8 @@ const connection = new Connection({
   onPixel: (answer) => hover.answer(answer),
   onGeometry: (geometry) => {
     geometries.set(geometry.stream, geometry);
+    mixing.look();
+    wipeLine.place();
     cloud.redraw();
   },
   onMeasure: (measure) => aids.measured(measure),
@@ -312,13 +327,13 @@ function act(action) {
       return cloud.toggle();
     case "aids":
       return showAids();
+    case "reference":
+      return void showReference();
     case "camera":
       cloud.close();
       return wall.enlargeCamera(action.n);
     case "enlarge": {
-      const focused = document.activeElement;
-      const id = focused instanceof HTMLElement ? focused.dataset.stream : undefined;
-      const tile = wall.tiles.get(id ?? "");
+      const tile = focusedTile();
       return tile === undefined ? undefined : wall.enlarge(tile);
     }
     case "playPause":
@@ -326,6 +341,13 @@ function act(action) {
     case "step":
       return replayBar.isShown ? replayBar.step(action.sets) : undefined;
   }
+}
+
+/** The tile that has the focus. */
+function focusedTile() {
+  const focused = document.activeElement;
+  const id = focused instanceof HTMLElement ? focused.dataset.stream : undefined;
+  return wall.tiles.get(id ?? "");
 }
 
 /** Aids go with an enlarged image: without one, the tile that has the focus or the first is enlarged. */
@@ -337,14 +359,36 @@ function showAids() {
     aids.toggle();
     return;
   }
-  const focused = document.activeElement;
-  const id = focused instanceof HTMLElement ? focused.dataset.stream : undefined;
-  const tile = wall.tiles.get(id ?? "") ?? [...wall.tiles.values()][0];
+  const tile = focusedTile() ?? [...wall.tiles.values()][0];
   if (tile !== undefined) {
     wall.enlarge(tile);
     if (!aids.isOpen) {
       aids.toggle();
     }
+  }
+}
+
+/** A reference goes with an enlarged image of colour or infrared, too. */
+async function showReference() {
+  if (cloud.isOpen) {
+    return;
+  }
+  if (wall.enlarged === null) {
+    const tile = focusedTile();
+    wall.enlarge(tile?.isDepth === false ? tile : ([...wall.tiles.values()].find(({ isDepth }) => !isDepth) ?? null));
+  }
+  if (wall.enlarged === null || wall.enlarged.isDepth) {
+    showProblem("A reference is kept of colour and infrared images.");
+    return;
+  }
+  try {
+    const { Reference } = await import("./reference.js");
+    reference ??= new Reference();
+    Object.assign(debug, { reference });
+    reference.enlarged(wall.enlarged);
+    reference.toggle();
+  } catch {
+    showProblem("The reference was not loaded: the daemon does not answer.");
   }
 }
 
@@ -374,6 +418,7 @@ setUpKeys();
 setUpSound();
 byId("show-help", HTMLButtonElement).addEventListener("click", () => byId("help", HTMLDialogElement).showModal());
 byId("close-help", HTMLButtonElement).addEventListener("click", () => byId("help", HTMLDialogElement).close());
+hasReference.addEventListener("click", () => void showReference());
 byId("reload", HTMLButtonElement).addEventListener("click", () => location.reload());
 // A new address in the same tab changes the fragment only, and loads nothing.
 addEventListener("hashchange", () => connection.open(takeToken(), dataset));

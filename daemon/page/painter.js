@@ -1,12 +1,12 @@
 /** Draws tiles: each at most once an animation frame, with its newest image. */
 
 /** @typedef {import("./tile.js").Tile} Tile */
-/** @typedef {{below: Tile, above: Tile, share: number}} BlendOfTiles */
+/** @typedef {import("./mixture.js").Mixture} Mixture */
 
 /**
  * @typedef {Object} PainterOptions
  * @property {import("./tile.js").Tables} tables
- * @property {() => {enlarged: Tile | null, blend: BlendOfTiles | null}} enlargement
+ * @property {() => {enlarged: Tile | null, mixture: Mixture | null}} enlargement
  * @property {(tile: Tile, ageMs: number) => void} onDrawn
  */
 
@@ -32,17 +32,17 @@ export class Painter {
 
   #frame() {
     this.#isFrameAsked = false;
-    const { enlarged, blend } = this.#options.enlargement();
-    const isBlendDirty = blend !== null && (this.#dirty.has(blend.below) || this.#dirty.has(blend.above));
-    if (enlarged !== null && isBlendDirty) {
+    const { enlarged, mixture } = this.#options.enlargement();
+    const isMixtureDirty = mixture !== null && (this.#dirty.has(mixture.below) || this.#dirty.has(mixture.above));
+    if (enlarged !== null && isMixtureDirty) {
       this.#dirty.add(enlarged);
     }
     const drawn = [...this.#dirty];
     this.#dirty.clear();
-    // All are taken before the first is drawn: a blend shows the newest image of both.
+    // All are taken before the first is drawn: a mixture shows the newest image of both.
     const taken = drawn.map((tile) => ({ tile, delivery: tile.takeNewest() }));
     for (const { tile, delivery } of taken) {
-      tile.draw(this.#options.tables, tile === enlarged ? blend : null);
+      tile.draw(this.#options.tables, tile === enlarged ? mixture : null);
       if (delivery !== null) {
         const sinceReceived = performance.now() - delivery.receivedAt;
         this.#options.onDrawn(tile, delivery.image.ageMs + sinceReceived);

@@ -76,6 +76,17 @@
  * @typedef {{file: string | null, cameras: CameraControls[]}} ControlList of `GET /v1/controls`
  * @typedef {{file: string | null, diff: string, fingerprint: string}} ControlChanges
  *
+ * @typedef {Object} Uncertainty of projection over an image
+ * @property {number} distance_m of the points that are projected
+ * @property {number} pixel_mm width of a pixel at that distance
+ * @property {number} columns
+ * @property {(number | null)[]} sigma_px row by row; `null` where the lens shows nothing
+ * @property {number} middle_px
+ * @property {number} worst_px
+ *
+ * @typedef {{stream: string, created: string, width: number, height: number, uncertainty: Uncertainty | null}} CalibratedImage
+ *   of `GET /v1/calibration`
+ *
  * @typedef {Object} CameraProgress of a capture of views of a board
  * @property {string} name
  * @property {number} corners

@@ -52,6 +52,8 @@ export class RecordBar {
   #answer = null;
   #answeredAt = -Infinity;
   #lossSoundAt = -Infinity;
+  /** @type {Promise<import("./lossstrip.js").LossStrip> | null} */
+  #lossTime = null;
   #toldError = "";
   #isLive = false;
   /** Whether the page shows the live rig, and no dataset. */
@@ -211,11 +213,33 @@ export class RecordBar {
     setText(this.#progress, texts.progress);
     setText(this.#losses, texts.losses);
     setText(this.#advice, texts.advice);
-    setState(this.#losses, texts.hasLosses ? "lost" : "none");
+    setState(this.#losses, texts.losing);
+    setState(this.#advice, texts.losing);
+    this.#showLossTime(recording, texts.losing !== "none", status.sets.nominal_hz);
     setText(this.#disk, texts.disk);
     setText(this.#warning, texts.warning);
     this.#showReady();
     this.#sound(facts.hasNewLosses, recording?.error ?? "");
+  }
+
+  /**
+   * When the losses were. The module for it is loaded with the first one.
+   *
+   * @param {import("./types.js").RecordingStatus | null} recording
+   * @param {boolean} hasLosses
+   * @param {number} setsHz
+   */
+  #showLossTime(recording, hasLosses, setsHz) {
+    if (hasLosses && this.#lossTime === null) {
+      const load = import("./lossstrip.js").then(({ LossStrip }) => new LossStrip(byId("loss-time", HTMLElement)));
+      // Without the daemon it is tried again with the next status.
+      load.catch(() => (this.#lossTime = null));
+      this.#lossTime = load;
+    }
+    void this.#lossTime?.then(
+      (strip) => strip.follow(hasLosses ? recording : null, setsHz),
+      () => {},
+    );
   }
 
   /**

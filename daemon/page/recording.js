@@ -1,6 +1,6 @@
 /** What the status says about the recording: state, rate and new losses, from one status to the next. */
 
-import { lossesSince, sumOf, total } from "./words.js";
+import { total } from "./words.js";
 
 /** @typedef {import("./types.js").Status} Status */
 /** @typedef {import("./types.js").RecordingStatus} RecordingStatus */
@@ -14,7 +14,8 @@ const RATE_OVER_NS = 5e9;
  * @property {RecordState} state
  * @property {number | null} bytesPerSecond `null` before it is known
  * @property {import("./words.js").Losses} sets lost
- * @property {import("./words.js").Losses} frames lost since the recording began, or since this page saw it first
+ * @property {import("./words.js").Losses} missing frames that sets lack, by stream
+ * @property {import("./words.js").Losses} frames lost since the recording began
  * @property {boolean} hasNewLosses since the status before, while recording
  */
 
@@ -48,8 +49,6 @@ export class RecordingWatch {
   /** The recording that the numbers are of: its folder. */
   #path = "";
   #lost = 0;
-  /** @type {import("./words.js").Losses} */
-  #framesBefore = {};
   /** @type {Sample[]} */
   #samples = [];
 
@@ -60,31 +59,26 @@ export class RecordingWatch {
    */
   follow(status, isStopping) {
     const { recording } = status;
-    const framesNow = sumOf(status.cameras.flatMap((camera) => camera.streams.map((stream) => stream.dropped)));
     const isNew = recording !== null && recording.path !== this.#path;
     if (recording === null || isNew) {
-      this.#begin(recording, framesNow);
+      this.#begin(recording);
     }
     if (recording === null) {
-      return { state: "idle", bytesPerSecond: null, sets: {}, frames: {}, hasNewLosses: false };
+      return { state: "idle", bytesPerSecond: null, sets: {}, missing: {}, frames: {}, hasNewLosses: false };
     }
     const state = stateOf(recording, isStopping);
-    const frames = recording.active ? lossesSince(framesNow, this.#framesBefore) : {};
-    const lost = total(recording.dropped) + total(frames);
+    const { dropped: sets, missing, frames_dropped: frames } = recording;
+    const lost = total(sets) + total(missing) + total(frames);
     const hasNewLosses = recording.active && !isNew && lost > this.#lost;
     this.#lost = recording.active ? lost : 0;
     const bytesPerSecond = this.#rate(recording, status.utc_ns);
-    return { state, bytesPerSecond, sets: recording.dropped, frames, hasNewLosses };
+    return { state, bytesPerSecond, sets, missing, frames, hasNewLosses };
   }
 
-  /**
-   * @param {RecordingStatus | null} recording
-   * @param {import("./words.js").Losses} framesNow
-   */
-  #begin(recording, framesNow) {
+  /** @param {RecordingStatus | null} recording */
+  #begin(recording) {
     this.#path = recording?.path ?? "";
     this.#lost = 0;
-    this.#framesBefore = framesNow;
     this.#samples = [];
   }
 

@@ -1,7 +1,7 @@
 /** How a recording stands, in words: pure functions. */
 
 import { lossAdvice } from "./advice.js";
-import { clock, disk, lossesInWords, size } from "./words.js";
+import { clock, disk, lossesInWords, missingInWords, size, total } from "./words.js";
 
 /** @typedef {import("./types.js").RecordingStatus} RecordingStatus */
 /** @typedef {import("./recording.js").RecordFacts} RecordFacts */
@@ -11,7 +11,7 @@ import { clock, disk, lossesInWords, size } from "./words.js";
  * @property {string} progress
  * @property {string} losses
  * @property {string} advice what to do about them
- * @property {boolean} hasLosses
+ * @property {"none" | "few" | "lost"} losing "few": what no set lacks
  * @property {string} disk
  * @property {string} warning
  */
@@ -23,15 +23,17 @@ import { clock, disk, lossesInWords, size } from "./words.js";
  */
 export function recordTexts(recording, facts) {
   if (recording === null) {
-    return { progress: "Nothing recorded yet", losses: "", advice: "", hasLosses: false, disk: "", warning: "" };
+    return { progress: "Nothing recorded yet", losses: "", advice: "", losing: "none", disk: "", warning: "" };
   }
-  const losses = [lossesInWords("set", facts.sets), lossesInWords("frame", facts.frames)].filter((text) => text !== "");
+  const { sets, missing, frames } = facts;
+  const losses = [lossesInWords("set", sets), missingInWords(missing), lossesInWords("frame", frames)];
+  const text = losses.filter((loss) => loss !== "").join("; ");
   const secondsLeft = recording.active ? recording.disk_seconds_left : null;
   return {
     progress: progressOf(recording, facts),
-    losses: losses.join("; ") || "No losses",
-    advice: lossAdvice(facts.sets, facts.frames),
-    hasLosses: losses.length > 0,
+    losses: text || "No losses",
+    advice: lossAdvice(sets, missing, frames),
+    losing: text === "" ? "none" : total(sets) + total(missing) > 0 ? "lost" : "few",
     disk: `Disk: ${disk(recording.disk_free_bytes, secondsLeft)}`,
     warning: [recording.error, recording.warning].filter(Boolean).join("; "),
   };

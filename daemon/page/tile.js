@@ -114,12 +114,12 @@ export class Tile {
   }
 
   /**
-   * Draws the shown image, or a blend of two of the same scene.
+   * Draws the shown image, or a mixture of two of the same scene.
    *
    * @param {Tables} tables
-   * @param {{below: Tile, above: Tile, share: number} | null} blend
+   * @param {import("./mixture.js").Mixture | null} mixture
    */
-  draw(tables, blend) {
+  draw(tables, mixture) {
     if (this.shown === null) {
       return;
     }
@@ -131,14 +131,37 @@ export class Tile {
     this.#context.globalAlpha = 1;
     this.#context.fillStyle = HOLE_COLOR;
     this.#context.fillRect(0, 0, columns, rows);
-    if (blend === null) {
+    if (mixture === null) {
       this.#paint(this.layer(tables), 1);
       return;
     }
-    if (blend.share < 1) {
-      this.#paint(blend.below.layer(tables), 1);
+    const { below, above, share, isWipe } = mixture;
+    if (share < 1) {
+      this.#paint(below.layer(tables), 1);
     }
-    this.#paint(blend.above.layer(tables), blend.share);
+    if (isWipe) {
+      this.#paintLeft(above.layer(tables), share * columns);
+    } else {
+      this.#paint(above.layer(tables), share);
+    }
+  }
+
+  /**
+   * Paints the left part; where it has holes, nothing shows through.
+   *
+   * @param {CanvasImageSource | null} layer
+   * @param {number} columns
+   */
+  #paintLeft(layer, columns) {
+    const { height } = this.canvas;
+    this.#context.save();
+    this.#context.beginPath();
+    this.#context.rect(0, 0, columns, height);
+    this.#context.clip();
+    this.#context.globalAlpha = 1;
+    this.#context.fillRect(0, 0, columns, height);
+    this.#paint(layer, 1);
+    this.#context.restore();
   }
 
   /**

@@ -44,12 +44,26 @@
  * @property {number} duration_s
  * @property {number} sets
  * @property {Record<string, number>} dropped
+ * @property {Record<string, number>} missing frames that recorded sets lack, by stream
+ * @property {Record<string, number>} frames_dropped frames that were lost before they reached their channel, by reason
  * @property {number} bytes
  * @property {number} backlog_bytes
  * @property {string | null} error
  * @property {number} disk_free_bytes
  * @property {number | null} disk_seconds_left
  * @property {string | null} [warning]
+ *
+ * @typedef {Object} LossBucket
+ * @property {number} from_s after the beginning of the recording
+ * @property {Record<string, number>} sets
+ * @property {Record<string, number>} missing
+ * @property {Record<string, number>} frames
+ *
+ * @typedef {Object} RecordingLosses of `GET /v1/record/losses`
+ * @property {string} path
+ * @property {number} duration_s
+ * @property {number} bucket_s
+ * @property {LossBucket[]} buckets with losses, in the order of time
  *
  * @typedef {Object} ReplayStatus
  * @property {string[]} datasets

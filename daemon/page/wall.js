@@ -15,7 +15,7 @@ import { WatchList, watchOf } from "./watch.js";
  * @property {(watched: Watch[]) => number} watch sends a watch list and returns its number; 0: not sent
  * @property {import("./tile.js").Tables} tables
  * @property {(enlarged: Tile | null) => void} onEnlarged
- * @property {(tile: Tile) => import("./painter.js").BlendOfTiles | null} blendOf
+ * @property {(tile: Tile) => import("./mixture.js").Mixture | null} mixtureOf
  * @property {(tile: Tile, ageMs: number) => void} onDrawn
  * @property {() => boolean} isMeasured whether the numbers of the enlarged stream are shown
  * @property {() => Watch[] | null} watchInstead what a view that takes the place of the wall needs; `null` without one
@@ -46,7 +46,7 @@ export class Wall {
     this.#watchList = new WatchList(options.watch);
     this.#painter = new Painter({
       tables: options.tables,
-      enlargement: () => ({ enlarged: this.enlarged, blend: this.#blend() }),
+      enlargement: () => ({ enlarged: this.enlarged, mixture: this.#mixture() }),
       onDrawn: options.onDrawn,
     });
     new ResizeObserver(() => this.#fit()).observe(this.#wall);
@@ -148,7 +148,7 @@ export class Wall {
   }
 
   #watch() {
-    const wanted = () => watchOf(this.tiles.values(), this.enlarged, this.#blend(), this.#options.isMeasured());
+    const wanted = () => watchOf(this.tiles.values(), this.enlarged, this.#mixture(), this.#options.isMeasured());
     const shown = this.#options.watchInstead() ?? wanted();
     const watched = document.hidden ? [] : shown;
     const now = performance.now();
@@ -160,8 +160,8 @@ export class Wall {
     }
   }
 
-  #blend() {
-    return this.enlarged === null ? null : this.#options.blendOf(this.enlarged);
+  #mixture() {
+    return this.enlarged === null ? null : this.#options.mixtureOf(this.enlarged);
   }
 
   /** @param {Tile} tile */

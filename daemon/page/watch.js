@@ -14,15 +14,15 @@ export const FULL_WIDTH = 0;
  * @template {Watchable} T
  * @param {Iterable<T>} tiles
  * @param {T | null} enlarged
- * @param {{below: T, above: T} | null} blend what the enlarged image is blended of
+ * @param {{below: T, above: T} | null} mixture what the enlarged image is made of
  * @param {boolean} [isMeasured] whether the numbers of the enlarged stream are shown
  * @returns {Watch[]}
  */
-export function watchOf(tiles, enlarged, blend, isMeasured = false) {
+export function watchOf(tiles, enlarged, mixture, isMeasured = false) {
   /** @type {Watch[]} */
   const watched = [];
   for (const tile of tiles) {
-    const isFull = tile === enlarged || tile === blend?.below || tile === blend?.above;
+    const isFull = tile === enlarged || tile === mixture?.below || tile === mixture?.above;
     if (isFull) {
       const measured = isMeasured && tile === enlarged ? { measure: true } : {};
       watched.push({ stream: tile.id, width: FULL_WIDTH, rate_hz: WALL_HZ, ...measured });

@@ -49,22 +49,17 @@ export function lossesInWords(noun, losses) {
 }
 
 /**
- * Losses that came after `before`.
+ * "5 sets lack front/depth", "7 frames missing in sets (4 front/depth, 3 left/color)"; empty if none is missing.
  *
- * @param {Losses} now
- * @param {Losses} before
- * @returns {Losses}
+ * @param {Losses} missing by stream
  */
-export function lossesSince(now, before) {
-  /** @type {Losses} */
-  const since = {};
-  for (const [reason, n] of Object.entries(now)) {
-    const more = n - (before[reason] ?? 0);
-    if (more > 0) {
-      since[reason] = more;
-    }
+export function missingInWords(missing) {
+  const streams = Object.entries(missing).filter(([, n]) => n > 0);
+  if (streams.length <= 1) {
+    return streams.map(([stream, n]) => `${n} set${n === 1 ? " lacks" : "s lack"} ${stream}`).join("");
   }
-  return since;
+  const parts = streams.sort((a, b) => b[1] - a[1]).map(([stream, n]) => `${n} ${stream}`);
+  return `${total(missing)} frames missing in sets (${parts.join(", ")})`;
 }
 
 /**

@@ -1,9 +1,12 @@
 //! Calls on a running rig, from any side: the HTTP API, the command line in process, or a test.
 
 use crate::doctor::Examined;
+pub use crate::losses::{LossBucket, Losses, RecordingLosses};
 use crate::status::{RecordingStatus, ReplayStatus, RigStatus};
 use crate::{Error, ErrorKind, Result};
 use depthrig_bus::{RigName, RuntimeDir, UtcPair};
+use depthrig_calibrate::file::CalibratedCamera;
+use depthrig_calibrate::mount::UncertaintyMap;
 use depthrig_driver::controls::ControlValue;
 use depthrig_recorder::{Mark, RecorderOptions, Session};
 use serde::{Deserialize, Serialize};
@@ -41,6 +44,10 @@ pub trait Control: Send + Sync {
     /// `WrongState` of a rig without cameras, and when the system cannot be read at all.
     fn doctor(&self) -> Result<Examined> {
         Err(Error::new(ErrorKind::WrongState, "this rig replays datasets and has no cameras to examine"))
+    }
+    /// How uncertain the calibration in use is over the images of each calibrated camera; none of a replay.
+    fn calibration(&self) -> Vec<CalibratedImage> {
+        Vec::new()
     }
     /// The controls of the cameras that can be changed while they stream.
     ///
@@ -98,6 +105,11 @@ pub trait Control: Send + Sync {
     /// `WrongState` when none is going on, `BadInput` for an empty note.
     fn record_note(&self, text: &str) -> Result<()>;
 
+    /// When the recording in progress, or the last one, lost something; `None` before the first.
+    fn record_losses(&self) -> Option<RecordingLosses> {
+        None
+    }
+
     /// Asks the daemon to end.
     fn request_stop(&self);
 
@@ -114,6 +126,59 @@ pub trait Control: Send + Sync {
 
 fn no_controls() -> Error {
     Error::new(ErrorKind::WrongState, "this rig replays datasets and has no cameras to control")
+}
+
+/// A stream that the calibration in use has images of.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct CalibratedImage {
+    /// The stream, `camera/stream`.
+    pub stream: String,
+    /// When the calibration was made.
+    pub created: String,
+    /// Columns of the images.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// How uncertain projection is over the image; `None` where the calibration's file does not have it.
+    pub uncertainty: Option<UncertaintyOfImage>,
+}
+
+/// How uncertain projection is over an image, as the calibration's report shows it.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct UncertaintyOfImage {
+    /// Distance of the points that are projected, metres.
+    pub distance_m: f64,
+    /// Width of a pixel at that distance, in the middle of the image, millimetres.
+    pub pixel_mm: f64,
+    /// Places along x; the first and the last are the borders of the image.
+    pub columns: usize,
+    /// Standard deviation in the worst direction, pixels, row by row; `None` where the lens shows nothing.
+    pub sigma_px: Vec<Option<f64>>,
+    /// In the middle of the image.
+    pub middle_px: f64,
+    /// The largest.
+    pub worst_px: f64,
+}
+
+impl CalibratedImage {
+    /// The image of an entry of a calibration that was made at `created`.
+    pub fn of(entry: &CalibratedCamera, created: &str) -> Self {
+        let uncertainty = |map: &UncertaintyMap| UncertaintyOfImage {
+            distance_m: map.distance_m,
+            pixel_mm: map.distance_m * 1e3 / entry.intrinsics.fx,
+            columns: map.columns,
+            sigma_px: map.sigma_px.iter().map(|s| Some(*s).filter(|s| s.is_finite())).collect(),
+            middle_px: map.middle_px(),
+            worst_px: map.worst_px(),
+        };
+        Self {
+            stream: format!("{}/{}", entry.name, entry.stream),
+            created: created.to_owned(),
+            width: entry.width,
+            height: entry.height,
+            uncertainty: entry.uncertainty.as_ref().map(uncertainty),
+        }
+    }
 }
 
 /// The controls of a rig's cameras.

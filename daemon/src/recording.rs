@@ -2,12 +2,12 @@
 
 use crate::config::{RecordingConfig, RigConfig};
 use crate::control::{LiveRig, RecordRequest};
+use crate::losses::{LossHistory, Losses, RecordingLosses};
 use crate::status::{RecordingStatus, SetAccount};
 use crate::stream::Stream;
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
-use depthrig_bus::sync::lock;
-use depthrig_bus::{Frame, HostTime, StreamId, UtcPair};
+use depthrig_bus::{DropCounts, Frame, HostTime, StreamId, UtcPair};
 use depthrig_recorder::{
     Diagnostic, Pixels, RecordFrame, RecordSet, Recorder, RecorderOptions, Session, StreamAccount, Summary,
     UtcSource, fs,
@@ -16,9 +16,10 @@ use place::place;
 pub use recovery::recover_left;
 use spread::{max_spread_ns, reach_ns};
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 
 pub mod budget;
+mod closing;
 mod facts;
 mod motion;
 mod place;
@@ -27,6 +28,7 @@ mod report;
 mod spread;
 mod texts;
 
+pub use closing::{Finishing, is_due, stop, stop_when_due};
 pub use facts::StreamFacts;
 pub use report::Reports;
 
@@ -36,6 +38,8 @@ pub struct Recording {
     active: Option<Active>,
     last: Option<RecordingStatus>,
     summary: Option<Summary>,
+    /// When the last recording, or the one that goes on, lost something.
+    losses: LossHistory,
     /// Accounts of IMU batches, recorded or not.
     motion: motion::Books,
 }
@@ -84,7 +88,9 @@ struct Recorded {
     stream: Arc<Stream>,
     captured: u64,
     delivered: u64,
-    dropped: depthrig_bus::DropCounts,
+    dropped: DropCounts,
+    /// Recorded sets that lack a frame of it.
+    missing: u64,
 }
 
 /// A frame's pixels where the driver wrote them; encoding reads them from there.
@@ -167,6 +173,7 @@ impl Begun {
                 captured: books.delivered + books.dropped.total(),
                 delivered: books.delivered,
                 dropped: books.dropped,
+                missing: 0,
             }
         };
         let started = HostTime::now();
@@ -219,6 +226,7 @@ impl Recording {
         active.motion.begin();
         active.refresh();
         self.summary = None;
+        self.losses = LossHistory::default();
         self.last.insert(active.status.clone()).clone()
     }
 
@@ -268,8 +276,15 @@ impl Recording {
     pub fn push(&mut self, set: RecordSet) {
         let Some(active) = &mut self.active else { return };
         active.motion.hand_over(&set.motion);
+        let missing = set.missing.clone();
         // A set that is refused is counted and logged by the recorder.
-        drop(active.recorder.push(set));
+        if active.recorder.push(set).is_ok() {
+            for stream in missing {
+                if let Some(recorded) = active.streams.get_mut(stream) {
+                    recorded.missing += 1;
+                }
+            }
+        }
     }
 
     /// Whether the next set would find room, or needs none.
@@ -316,6 +331,9 @@ impl Recording {
 
     /// Keeps the numbers of a finished recording.
     pub fn keep(&mut self, status: RecordingStatus, summary: Option<Summary>) {
+        // Sets that were lost while it was closed are lost at its end.
+        let end_s = self.last.as_ref().map_or(0.0, |last| last.duration_s);
+        self.losses.note(ns(end_s), &losses_of(&status));
         self.last = Some(status);
         self.summary = summary;
     }
@@ -326,13 +344,22 @@ impl Recording {
         self.last.clone()
     }
 
+    /// When the recording in progress, or the last one, lost something.
+    pub fn losses(&mut self) -> Option<RecordingLosses> {
+        self.refresh();
+        let last = self.last.as_ref()?;
+        let (bucket_s, buckets) = self.losses.buckets();
+        Some(RecordingLosses { path: last.path.clone(), duration_s: last.duration_s, bucket_s, buckets })
+    }
+
     /// Summary of the last finished recording.
     pub fn summary(&self) -> Option<&Summary> {
         self.summary.as_ref()
     }
 
     /// Once a second: accounts and diagnostics into the file.
-    pub fn housekeeping(&self, diagnostics: Vec<Diagnostic>) {
+    pub fn housekeeping(&mut self, diagnostics: Vec<Diagnostic>) {
+        self.refresh();
         if let Some(active) = &self.active {
             active.hand_over_accounts();
             active.recorder.diagnostics(diagnostics);
@@ -342,17 +369,39 @@ impl Recording {
     fn refresh(&mut self) {
         let Some(active) = &mut self.active else { return };
         active.refresh();
+        self.losses.note(ns(active.status.duration_s), &losses_of(&active.status));
         self.last = Some(active.status.clone());
+    }
+}
+
+/// A length in nanoseconds.
+fn ns(seconds: f64) -> u64 {
+    (seconds.max(0.0) * 1e9) as u64
+}
+
+/// Everything that the recording lost so far.
+fn losses_of(status: &RecordingStatus) -> Losses {
+    Losses {
+        sets: status.dropped.clone(),
+        missing: status.missing.clone(),
+        frames: status.frames_dropped.clone(),
     }
 }
 
 impl Active {
     fn refresh(&mut self) {
         let progress = self.recorder.progress();
+        let mut dropped = DropCounts::default();
+        for account in self.accounts() {
+            dropped.0.iter_mut().zip(account.dropped.0).for_each(|(sum, n)| *sum += n);
+        }
         let status = &mut self.status;
         status.duration_s = self.started.elapsed().as_secs_f64();
         status.sets = progress.sets.recorded;
         status.dropped = progress.sets.dropped_by_reason().map(|(r, n)| (r.name().to_owned(), n)).collect();
+        let missing = self.streams.iter().filter(|r| r.missing > 0);
+        status.missing = missing.map(|r| (r.stream.id.to_string(), r.missing)).collect();
+        status.frames_dropped = dropped.nonzero().map(|(r, n)| (r.name().to_owned(), n)).collect();
         status.frames = progress.frames;
         status.bytes = progress.bytes;
         status.encode_queue = progress.encode_queue as u64;
@@ -365,8 +414,13 @@ impl Active {
         status.warning = progress.disk.warning;
     }
 
-    /// Hands over the cameras' accounts since the recording began.
+    /// Hands over the cameras' accounts.
     fn hand_over_accounts(&self) {
+        self.recorder.update_accounts(self.accounts().collect());
+    }
+
+    /// The cameras' accounts since the recording began.
+    fn accounts(&self) -> impl Iterator<Item = StreamAccount> + '_ {
         let account = |r: &Recorded| {
             let books = r.stream.books();
             // A frame that is being written this moment is not accounted for before its fate is known.
@@ -382,85 +436,8 @@ impl Active {
                 dropped,
             }
         };
-        let streams = self.streams.iter().map(account);
-        self.recorder.update_accounts(streams.chain(self.motion.accounts()).collect());
+        self.streams.iter().map(account).chain(self.motion.accounts())
     }
-}
-
-/// A recording that takes no more sets and is being closed.
-pub struct Finishing {
-    active: Active,
-}
-
-impl Finishing {
-    /// Waits until everything is on disk.
-    ///
-    /// # Errors
-    /// `Other` when the dataset could not be closed; the status is as complete as possible all the same.
-    pub fn finish(mut self) -> (RecordingStatus, Result<Summary>) {
-        self.active.refresh();
-        let mut status = self.active.status;
-        status.active = false;
-        (status.encode_queue, status.backlog_bytes) = (0, 0);
-        match self.active.recorder.finish() {
-            Ok(summary) => {
-                status.sets = summary.sets.recorded;
-                status.dropped =
-                    summary.sets.dropped_by_reason().map(|(r, n)| (r.name().to_owned(), n)).collect();
-                status.frames = summary.frames;
-                status.bytes = summary.bytes;
-                status.segments = u64::from(summary.segments);
-                status.duration_s = summary.duration_ns as f64 * 1e-9;
-                if summary.complete {
-                    tracing::info!(path = status.path, sets = status.sets, bytes = status.bytes, "recorded");
-                } else {
-                    let lost = summary.lost.join("; ");
-                    tracing::error!(path = status.path, "the recording lost something: {lost}");
-                    status.error = Some(lost);
-                }
-                (status, Ok(summary))
-            }
-            Err(e) => {
-                status.error = Some(e.to_string());
-                tracing::error!(path = status.path, error = %e, "the recording could not be closed");
-                (status, Err(e.into()))
-            }
-        }
-    }
-}
-
-/// Ends the recording and closes its files. Other users of `recording` need not wait for the disk.
-///
-/// # Errors
-/// `WrongState` when none is going on, `Other` when the dataset could not be closed.
-pub fn stop(recording: &Mutex<Recording>) -> Result<RecordingStatus> {
-    let finishing = lock(recording).take()?;
-    finish(recording, finishing)
-}
-
-/// Whether the recording has lasted as long as it was to: to be asked often.
-pub fn is_due(recording: &Mutex<Recording>) -> bool {
-    lock(recording).is_due()
-}
-
-/// Ends the recording, as [`stop`] does, if it has lasted as long as it was to. `None`: it is not
-/// over yet, or none is going on. The moment it ends is that of its start and its length, however late the call comes.
-pub fn stop_when_due(recording: &Mutex<Recording>) -> Option<Result<RecordingStatus>> {
-    let mut idle = lock(recording);
-    let finishing = if idle.is_due() { idle.take().ok()? } else { return None };
-    drop(idle);
-    tracing::info!(path = finishing.active.status.path, "the recording has lasted as long as it was to");
-    Some(finish(recording, finishing))
-}
-
-fn finish(recording: &Mutex<Recording>, finishing: Finishing) -> Result<RecordingStatus> {
-    let (status, result) = finishing.finish();
-    let mut recording = lock(recording);
-    // Another one may have begun while this one was being closed; its numbers are not these.
-    if !recording.is_active() {
-        recording.keep(status.clone(), result.as_ref().ok().cloned());
-    }
-    result.map(|_| status)
 }
 
 fn none_active() -> Error {

@@ -427,6 +427,12 @@ pub struct RecordingStatus {
     pub sets: u64,
     /// Sets lost, by reason.
     pub dropped: BTreeMap<String, u64>,
+    /// Frames that recorded sets lack, by stream.
+    #[serde(default)]
+    pub missing: BTreeMap<String, u64>,
+    /// Frames of recorded streams that were lost before they reached their channel, by reason.
+    #[serde(default)]
+    pub frames_dropped: BTreeMap<String, u64>,
     /// Frames written.
     pub frames: u64,
     /// Bytes written.

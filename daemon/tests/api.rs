@@ -151,6 +151,8 @@ fn every_answer_of_a_live_server_fits_the_document() {
     };
     check("GET", "/v1/record", &served.get("/v1/record"), 200);
     assert_eq!(served.get("/v1/record").json(), Value::Null);
+    check("GET", "/v1/record/losses", &served.get("/v1/record/losses"), 200);
+    assert_eq!(served.get("/v1/record/losses").json(), Value::Null);
     check("GET", "/v1/status", &served.get("/v1/status"), 200);
     check("POST", "/v1/record/stop", &served.post("/v1/record/stop", ""), 409);
     check("POST", "/v1/record/note", &served.post("/v1/record/note", r#"{"text": "x"}"#), 409);
@@ -158,9 +160,11 @@ fn every_answer_of_a_live_server_fits_the_document() {
     check("POST", "/v1/record/start", &served.post("/v1/record/start", "{}"), 409);
     check("GET", "/v1/status", &served.get("/v1/status"), 200);
     check("GET", "/v1/record", &served.get("/v1/record"), 200);
+    check("GET", "/v1/record/losses", &served.get("/v1/record/losses"), 200);
     check("POST", "/v1/record/note", &served.post("/v1/record/note", r#"{"text": "lamp on"}"#), 204);
     check("POST", "/v1/record/note", &served.post("/v1/record/note", r#"{"text": ""}"#), 400);
     check("POST", "/v1/record/stop", &served.post("/v1/record/stop", ""), 200);
+    check("GET", "/v1/calibration", &served.get("/v1/calibration"), 200);
     check("GET", "/v1/health", &served.get("/v1/health"), 503);
     served.fake.set_all(CameraState::Streaming);
     check("GET", "/v1/health", &served.get("/v1/health"), 200);

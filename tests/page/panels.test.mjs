@@ -14,6 +14,7 @@ const { actionOf } = await load("keys.js");
 const { readiness } = await load("ready.js");
 const { healthText, numbersOf, titleOf, when, whyNotWatched } = await load("recordingtext.js");
 const { pairSkews, preferredStream, signedMs, skewState, streamOfEach, streamSkews, windowMs } = await load("skew.js");
+const { heat, uncertaintyText } = await load("uncertaintytext.js");
 const { bySeverity, linkState, linkText, notInRig, usbTree } = await load("usbtree.js");
 
 const stream = (id, more = {}) => ({ id, nominal_hz: 30, last_frame_age_ms: 20, samples_hz: null, ...more });
@@ -75,10 +76,11 @@ test("the address of a dataset holds any name", () => {
 });
 
 test("losses say what to do, sets before frames, the most frequent reason first", () => {
-  assert.match(lossAdvice({ disk_slow: 1, encoder_busy: 3 }, { device_gap: 99 }), /encodes too slowly/);
-  assert.match(lossAdvice({}, { device_gap: 9, no_slot: 1 }), /USB/);
-  assert.equal(lossAdvice({ disk_slow: 0 }, {}), "");
-  assert.match(lossAdvice({ weather: 1 }, {}), /log/);
+  assert.match(lossAdvice({ disk_slow: 1, encoder_busy: 3 }, {}, { device_gap: 99 }), /encodes too slowly/);
+  assert.match(lossAdvice({}, { "a/color": 4 }, { device_gap: 9, no_slot: 1 }), /USB/);
+  assert.equal(lossAdvice({ disk_slow: 0 }, {}, {}), "");
+  assert.match(lossAdvice({}, { "a/color": 1, "b/color": 2 }, {}), /b\/color/);
+  assert.match(lossAdvice({ weather: 1 }, {}, {}), /log/);
 });
 
 test("a rig is ready when every stream comes", () => {
@@ -220,4 +222,12 @@ test("a calibration and a capture are put in words", () => {
   const seen = { views: 3, coverage: [0, 2, 0, 9], corners: 0, worst_px: null };
   assert.equal(coverageText(seen), "3 views · 2 of 4 parts of the image · does not see the board");
   assert.match(coverageText({ ...seen, worst_px: 0.456, corners: 24 }), /within 0.46 px · sees 24 corners/);
+});
+
+test("the uncertainty of a calibration has the colours of its report, and words", () => {
+  assert.deepEqual([0, 0.5, 1, 7].map(heat), ["hsl(130 70% 60%)", "hsl(65 70% 60%)", "hsl(0 70% 60%)", "hsl(0 70% 60%)"]);
+  const image = { stream: "a/color", created: "", width: 4, height: 3, uncertainty: null };
+  assert.match(uncertaintyText(image), /^a\/color: the calibration's file has no map of uncertainty/);
+  const uncertainty = { distance_m: 0.8, pixel_mm: 1.5, columns: 2, sigma_px: [0.1, null], middle_px: 0.1, worst_px: 0.42 };
+  assert.match(uncertaintyText({ ...image, uncertainty }), /at 0\.80 m, .*0\.10 px \(0\.15 mm\) in the middle, at most 0\.42 px \(0\.63 mm\)/);
 });

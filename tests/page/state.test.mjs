@@ -61,7 +61,7 @@ const key = (name, more = {}) => ({ key: name, repeat: false, ctrlKey: false, al
 const nowhere = { isText: false, takesSpace: false, takesEnter: false, takesArrows: false, takesLetters: false, isInDialog: false };
 
 test("keys do nothing in text fields and dialogs, nor with modifiers", () => {
-  for (const name of [" ", "n", "1", "?", "Escape", "ArrowLeft", "p", "r", "b", "G", "m", "l", "y", "d", "c", "k"]) {
+  for (const name of [" ", "n", "1", "?", "Escape", "ArrowLeft", "p", "r", "b", "G", "m", "l", "y", "d", "c", "k", "a", "o", "v"]) {
     assert.notEqual(actionOf(key(name), nowhere), null, name);
     assert.equal(actionOf(key(name), { ...nowhere, isText: true }), null, name);
     assert.equal(actionOf(key(name), { ...nowhere, isInDialog: true }), null, name);
@@ -78,8 +78,8 @@ test("a key that is held starts and stops once; arrows may repeat", () => {
   assert.equal(actionOf(key("0"), nowhere), null);
 });
 
-const recording = (more) => ({ active: true, path: "/d", dropped: {}, bytes: 0, duration_s: 0, ...more });
-const status = (seconds, taken, dropped = {}) => ({ utc_ns: seconds * 1e9, cameras: [{ streams: [{ dropped }] }], recording: taken });
+const recording = (more) => ({ active: true, path: "/d", dropped: {}, missing: {}, frames_dropped: {}, bytes: 0, duration_s: 0, ...more });
+const status = (seconds, taken) => ({ utc_ns: seconds * 1e9, cameras: [], recording: taken });
 
 test("a recording that is being closed says so, for whoever asked", () => {
   const watch = new RecordingWatch();
@@ -94,11 +94,14 @@ test("a recording that is being closed says so, for whoever asked", () => {
 
 test("losses count from the start of the recording, and are new once", () => {
   const watch = new RecordingWatch();
-  assert.equal(watch.follow(status(0, recording({ duration_s: 0 }), { no_slot: 7 }), false).hasNewLosses, false);
-  const later = watch.follow(status(1, recording({ duration_s: 1 }), { no_slot: 9 }), false);
-  assert.deepEqual(later.frames, { no_slot: 2 });
-  assert.equal(later.hasNewLosses, true);
-  assert.equal(watch.follow(status(2, recording({ duration_s: 2 }), { no_slot: 9 }), false).hasNewLosses, false);
+  const lost = (n, more = {}) => recording({ frames_dropped: { no_slot: n }, ...more });
+  // A page that is opened late shows them all, and none as news.
+  assert.deepEqual([watch.follow(status(0, lost(7)), false)].map((f) => [f.frames, f.hasNewLosses]), [[{ no_slot: 7 }, false]]);
+  assert.equal(watch.follow(status(1, lost(9)), false).hasNewLosses, true);
+  assert.equal(watch.follow(status(2, lost(9)), false).hasNewLosses, false);
+  assert.equal(watch.follow(status(3, lost(9, { missing: { "a/color": 1 } })), false).hasNewLosses, true);
+  const ended = watch.follow(status(4, lost(9, { active: false })), false);
+  assert.deepEqual([ended.frames, ended.hasNewLosses], [{ no_slot: 9 }, false]);
 });
 
 test("the rate is that of the last seconds", () => {

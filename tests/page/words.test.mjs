@@ -5,7 +5,7 @@ import { load } from "./page.mjs";
 
 const { recordTexts } = await load("recordtext.js");
 const { addScene, parseScenes } = await load("scenes.js");
-const { age, clock, disk, hoverText, lossesInWords, lossesSince, size, sumOf } = await load("words.js");
+const { age, clock, disk, hoverText, lossesInWords, missingInWords, size, sumOf } = await load("words.js");
 
 test("losses are named by their reasons, the most frequent first", () => {
   assert.equal(lossesInWords("set", {}), "");
@@ -15,8 +15,13 @@ test("losses are named by their reasons, the most frequent first", () => {
   assert.equal(lossesInWords("frame", { new_reason: 2 }), "2 frames lost (new reason)");
 });
 
-test("losses are counted from a moment on", () => {
-  assert.deepEqual(lossesSince({ a: 5, b: 2, c: 1 }, { a: 3, b: 2 }), { a: 2, c: 1 });
+test("frames that sets lack are named by their stream", () => {
+  assert.equal(missingInWords({}), "");
+  assert.deepEqual([missingInWords({ "a/color": 1 }), missingInWords({ "a/color": 5, "b/depth": 0 })], ["1 set lacks a/color", "5 sets lack a/color"]);
+  assert.equal(missingInWords({ "a/color": 3, "b/depth": 4 }), "7 frames missing in sets (4 b/depth, 3 a/color)");
+});
+
+test("losses are summed by reason", () => {
   assert.deepEqual(sumOf([{ a: 1 }, { a: 2, b: 3 }]), { a: 3, b: 3 });
 });
 
@@ -49,15 +54,20 @@ test("a recording is described by what there is", () => {
     active: true, path: "/d/x", name: "x", dropped: {}, duration_s: 65, sets: 9, bytes: 2e9, backlog_bytes: 3e6,
     error: null, warning: "little room left", disk_free_bytes: 4e9, disk_seconds_left: 90,
   };
-  const facts = { state: "recording", bytesPerSecond: 42e6, sets: { disk_slow: 2 }, frames: {}, hasNewLosses: false };
+  const facts = { state: "recording", bytesPerSecond: 42e6, sets: { disk_slow: 2 }, missing: {}, frames: {}, hasNewLosses: false };
   assert.deepEqual(recordTexts(recording, facts), {
     progress: "01:05 · 9 sets · 2.0 GB · 42.0 MB/s · x",
     losses: "2 sets lost (the disk is too slow)",
     advice: "The disk takes less than the rig writes: record to a faster disk, or record fewer or smaller streams.",
-    hasLosses: true,
+    losing: "lost",
     disk: "Disk: 1 min left, 4.0 GB free",
     warning: "little room left",
   });
+  const few = recordTexts(recording, { ...facts, sets: {}, frames: { device_gap: 3 } });
+  assert.deepEqual([few.losing, few.losses], ["few", "3 frames lost (did not reach this computer)"]);
+  const lacking = recordTexts(recording, { ...facts, sets: {}, missing: { "a/color": 2 } });
+  assert.deepEqual([lacking.losing, lacking.losses], ["lost", "2 sets lack a/color"]);
+  assert.deepEqual(recordTexts(recording, { ...facts, sets: {} }).losing, "none");
   assert.match(recordTexts(recording, { ...facts, state: "closing" }).progress, /3.0 MB wait for the disk/);
   assert.match(recordTexts({ ...recording, active: false }, { ...facts, state: "idle" }).progress, /^Last: /);
   assert.equal(recordTexts(null, facts).progress, "Nothing recorded yet");

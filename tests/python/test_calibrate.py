@@ -60,7 +60,14 @@ def test_real_images_give_the_published_calibration(binary: str, runtime: Path, 
     assert abs(baseline / (SQUARE_MM * 1e-3) - 3.3275) < 0.01
     # The file says the same, and nothing is written twice.
     assert tomllib.loads(out.read_text())["camera"][0]["intrinsics"]["fx"] == left["intrinsics"]["fx"]
-    assert "<svg" in out.with_suffix(".html").read_text()
+    report = out.with_suffix(".html").read_text()
+    assert "<svg" in report
+    # The report's map of uncertainty is in the file as well, where the live page finds it.
+    maps = re.findall(r'aria-label="Uncertainty of projection.*?</figure>', report, re.DOTALL)
+    for drawn, camera in zip(maps, tomllib.loads(out.read_text())["camera"], strict=True):
+        labels = [float(label) for label in re.findall(r"<title>(.*?)</title>", drawn)]
+        assert camera["uncertainty"]["sigma_px"] == pytest.approx(labels, abs=0.0051)
+        assert max(camera["uncertainty"]["sigma_px"]) == pytest.approx(camera["quality"]["projection_worst_px"], abs=1e-3)
     again = command(binary, runtime, "calibrate", "solve", *arguments, codes=(2,))
     assert again == ""
 

@@ -3,6 +3,7 @@
 
 use depthrig_bus::HostTime;
 use depthrig_daemon::ErrorKind;
+use depthrig_daemon::control::{Losses, RecordRequest};
 use depthrig_daemon::status::{CameraState, RigStatus};
 use depthrig_tests::{Home, RigText, all_stream, assert_balanced, camera, wait_until};
 use std::time::Duration;
@@ -67,6 +68,49 @@ fn broken_frames_are_dropped_and_counted() {
         let status = run(kind, "count = 3", |s| lost(s, reason) > 0);
         assert_eq!(lost(&status, reason), 6, "three frames of two streams each: {kind}");
     }
+}
+
+/// Frames that a camera loses are in the history of the recording by reason, sets that lack them by stream.
+#[test]
+fn a_recording_knows_when_it_lost_something() {
+    let text = RigText::default().camera("good", "").camera("bad", "").fault("damaged", 4.0, "count = 60");
+    let home = Home::default();
+    let rig = home.start(text.text()).unwrap();
+    wait_until(&rig, "streaming", all_stream);
+    let control = rig.control();
+    assert_eq!(control.record_losses(), None, "nothing was recorded yet");
+    let request = RecordRequest { directory: Some(home.path("data")), ..RecordRequest::default() };
+    control.record_start(&request).unwrap();
+    let seen = |s: &RigStatus| {
+        let recording = s.recording.as_ref();
+        recording.is_some_and(|r| {
+            r.missing.contains_key("bad/color") && r.frames_dropped.contains_key("device_error")
+        })
+    };
+    wait_until(&rig, "losses", seen);
+    wait_until(&rig, "all damaged frames", |s| lost(s, "device_error") == 120);
+    let stopped = control.record_stop().unwrap();
+    let losses = control.record_losses().unwrap();
+    rig.stop();
+    let mut sum = Losses::default();
+    for bucket in &losses.buckets {
+        for (to, from) in [
+            (&mut sum.sets, &bucket.losses.sets),
+            (&mut sum.missing, &bucket.losses.missing),
+            (&mut sum.frames, &bucket.losses.frames),
+        ] {
+            for (reason, n) in from {
+                *to.entry(reason.clone()).or_default() += n;
+            }
+        }
+    }
+    assert_eq!(losses.path, stopped.path);
+    assert_eq!(
+        sum,
+        Losses { sets: stopped.dropped, missing: stopped.missing, frames: stopped.frames_dropped }
+    );
+    assert!(sum.frames["device_error"] <= 120 && sum.missing["bad/color"] > 0, "{sum:?}");
+    assert!(!sum.missing.keys().any(|stream| stream.starts_with("good/")), "{sum:?}");
 }
 
 #[test]

@@ -8,7 +8,7 @@
 
 use depthrig_bus::{Bus, HostTime, RigName, StreamId, UtcPair};
 use depthrig_daemon::ErrorKind;
-use depthrig_daemon::control::RecordRequest;
+use depthrig_daemon::control::{RecordRequest, RecordingLosses};
 use depthrig_daemon::rig::{Rig, RigOptions};
 use depthrig_daemon::status::RecordingStatus;
 use depthrig_recorder::{Dataset, DatasetSet, SetRange, Severity, VerifyOptions, verify};
@@ -99,6 +99,8 @@ struct Left {
     /// Most sets that waited for an encoder.
     encode_queue: u64,
     grown_bytes: u64,
+    /// When it lost something.
+    losses: RecordingLosses,
 }
 
 /// Runs a rig that records into `data`, watches it, lets `fault` happen and looks for `length` at what comes of it.
@@ -144,7 +146,8 @@ fn run(
             }
             let stopped = control.record_stop();
             let grown_bytes = resident.saturating_sub(before);
-            Left { recording, stopped, backlog_bytes, encode_queue, grown_bytes }
+            let losses = control.record_losses().unwrap();
+            Left { recording, stopped, backlog_bytes, encode_queue, grown_bytes, losses }
         }));
         stop.store(true, Ordering::SeqCst);
         (result, watcher.join().unwrap())
@@ -211,6 +214,12 @@ fn a_disk_that_stalls_costs_counted_sets_and_nothing_else() {
     assert!(left.backlog_bytes >= BACKLOG, "the backlog was never full");
     assert!(stopped.error.as_ref().is_some_and(|e| e.contains("disk_slow")), "{:?}", stopped.error);
     assert_eq!(stopped.dropped.keys().collect::<Vec<_>>(), ["disk_slow"]);
+    // The history knows when: every set, in seconds one after the other, and none before the backlog was full.
+    let seconds: Vec<f64> = left.losses.buckets.iter().map(|b| b.from_s).collect();
+    let lost = left.losses.buckets.iter().map(|b| b.losses.sets["disk_slow"]).sum::<u64>();
+    assert_eq!((lost, left.losses.path.as_str()), (dropped, stopped.path.as_str()));
+    assert!(seconds.len() > 1 && seconds[0] >= 1.0, "{seconds:?}");
+    assert!(seconds.last().unwrap() - seconds[0] < left.losses.duration_s, "{seconds:?}");
     // It goes on after the stall: the last set is later than the stall's end.
     let sets = sets_of(&stopped.path, true);
     assert_eq!(sets.len() as u64, stopped.sets);

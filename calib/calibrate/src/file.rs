@@ -3,7 +3,7 @@
 use crate::adjustment::INTRINSIC_PARAMETERS;
 use crate::board::Board;
 use crate::intrinsics::ImageSize;
-use crate::mount::{CameraResult, MountResult, Source};
+use crate::mount::{CameraResult, MountResult, Source, UncertaintyMap};
 use depthrig_bus::{Distortion, Intrinsics, Pose};
 use depthrig_calib::{Error, ErrorKind, Result};
 use nalgebra::{Matrix6, Vector6};
@@ -77,6 +77,9 @@ pub struct CalibratedCamera {
     pub conditions: Conditions,
     /// Measures of how good they are.
     pub quality: Quality,
+    /// Uncertainty of projection over the image, of which `quality` has the middle and the largest; files of earlier versions have none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub uncertainty: Option<UncertaintyMap>,
     /// How late its frames are delivered, once `depthrig calibrate time` has found it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub latency: Option<FileLatency>,
@@ -299,6 +302,10 @@ impl CalibratedCamera {
                 halves_differ_mm: halves.and_then(|h| h.pose).map(|p| p.metres * 1e3),
                 halves_differ_deg: halves.and_then(|h| h.pose).map(|p| p.radians.to_degrees()),
             },
+            uncertainty: Some(UncertaintyMap {
+                sigma_px: camera.uncertainty.sigma_px.iter().map(|s| (s * 1e4).round() / 1e4).collect(),
+                ..camera.uncertainty.clone()
+            }),
             latency: None,
         }
     }
@@ -354,6 +361,10 @@ impl CalibratedCamera {
         }
         if self.pose.translation_m.iter().any(|t| !t.is_finite()) {
             return bad("translation_m is not finite".to_owned());
+        }
+        let is_grid = |m: &UncertaintyMap| m.columns > 0 && m.sigma_px.len().is_multiple_of(m.columns);
+        if !self.uncertainty.as_ref().is_none_or(is_grid) {
+            return bad("uncertainty has rows of `columns` values each".to_owned());
         }
         if let Some(latency) = &self.latency {
             latency.check()?;

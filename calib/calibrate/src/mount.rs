@@ -86,21 +86,22 @@ pub struct CameraResult {
     pub rms_px: f64,
     /// Where in the image corners were seen.
     pub coverage: Coverage,
-    /// Uncertainty of projection over the image at [`CameraResult::distance_m`].
+    /// Uncertainty of projection over the image.
     pub uncertainty: UncertaintyMap,
-    /// The distance of the boards, at which uncertainty is stated: the median.
-    pub distance_m: f64,
     /// The calibration of one half of the views against that of the other.
     pub cross_validation: Option<CrossValidation>,
 }
 
-/// Uncertainty of projection at places of a grid.
-#[derive(Debug, Clone, PartialEq)]
+/// Uncertainty of projection at places of a grid, the corners of the image among them.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct UncertaintyMap {
-    /// Standard deviation in the worst direction, pixels, row by row; NaN where the lens shows nothing.
-    pub sigma_px: Vec<f64>,
+    /// Distance of the points that are projected: the median of the boards'.
+    pub distance_m: f64,
     /// Places along x.
     pub columns: usize,
+    /// Standard deviation in the worst direction, pixels, row by row; NaN where the lens shows nothing.
+    pub sigma_px: Vec<f64>,
 }
 
 impl UncertaintyMap {
@@ -355,8 +356,7 @@ fn camera_result(
         outliers: found.fit.outliers.iter().filter(|o| own.contains(&o.sighting)).count(),
         rms_px: (squares / corners.max(1) as f64).sqrt(),
         coverage: Coverage::new(camera.size, seen.iter().flatten().map(|c| c.pixel)),
-        uncertainty: UncertaintyMap { sigma_px, columns: MAP_COLUMNS },
-        distance_m,
+        uncertainty: UncertaintyMap { distance_m, columns: MAP_COLUMNS, sigma_px },
         cross_validation: halves.map(|h| cross_validation(index, camera.size, adjusted, h)).transpose()?,
     })
 }

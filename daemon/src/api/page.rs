@@ -34,19 +34,20 @@ macro_rules! files {
 }
 
 /// The files in the folder `page`.
-pub(super) static FILES: [File; 76] = files![
-    "advice.js" "aids.js" "aidsdepth.js" "aidsimage.js" "aidsoverlay.js" "api.js" "blend.js"
-    "boardoverlay.js" "calibrationpanel.js" "calibrationtext.js" "cloudbar.js" "cloudgl.js"
-    "cloudhints.js" "cloudinput.js" "cloudlabels.js" "cloudscene.js" "cloudshaders.js"
-    "cloudsource.js" "cloudview.js" "colormap.js" "connection.js" "controlrow.js" "controlspanel.js"
-    "controltext.js" "countdown.js" "dataset.js" "depthstats.js" "doctorpanel.js" "dom.js"
-    "doublepress.js" "eventstream.js" "fit.js" "hover.js" "icon.svg" "imagestats.js" "index.html"
-    "keys.js" "labels.js" "layout.js" "lens.js" "livestatus.js" "main.js" "matrix.js" "orbit.js"
-    "painter.js" "panels.css" "panels.js" "paneltypes.js" "plane.js" "protocol.js" "range.js"
-    "ready.js" "recordbar.js" "recording.js" "recordingrow.js" "recordings.js" "recordingtext.js"
-    "recordtext.js" "replaybar.js" "savedialog.js" "scenes.js" "skew.js" "slot.js" "sound.js"
-    "style.css" "syncpanel.js" "takes.js" "thinning.js" "tile.js" "tilestate.js" "types.js"
-    "usbtree.js" "view.css" "wall.js" "watch.js" "words.js"
+pub(super) static FILES: [File; 84] = files![
+    "advice.js" "aids.js" "aidsdepth.js" "aidsimage.js" "aidsoverlay.js" "api.js" "boardoverlay.js"
+    "calibrationpanel.js" "calibrationtext.js" "cloudbar.js" "cloudgl.js" "cloudhints.js"
+    "cloudinput.js" "cloudlabels.js" "cloudscene.js" "cloudshaders.js" "cloudsource.js"
+    "cloudview.js" "colormap.js" "connection.js" "controlrow.js" "controlspanel.js" "controltext.js"
+    "countdown.js" "dataset.js" "depthstats.js" "doctorpanel.js" "dom.js" "doublepress.js"
+    "eventstream.js" "fit.js" "hover.js" "icon.svg" "imagestats.js" "index.html" "keys.js"
+    "labels.js" "layout.js" "lens.js" "livestatus.js" "lossstrip.js" "losstime.js" "main.js"
+    "matrix.js" "mixture.js" "orbit.js" "painter.js" "panels.css" "panels.js" "paneltypes.js"
+    "plane.js" "protocol.js" "range.js" "ready.js" "recordbar.js" "recording.js" "recordingrow.js"
+    "recordings.js" "recordingtext.js" "recordtext.js" "reference.js" "referencetext.js"
+    "replaybar.js" "savedialog.js" "scenes.js" "shift.js" "skew.js" "slot.js" "sound.js" "style.css"
+    "syncpanel.js" "takes.js" "thinning.js" "tile.js" "tilestate.js" "types.js" "uncertaintymap.js"
+    "uncertaintytext.js" "usbtree.js" "view.css" "wall.js" "watch.js" "wipeline.js" "words.js"
 ];
 
 /// Where reports are, each below an address of its own: a tab that is opened cannot send the token.

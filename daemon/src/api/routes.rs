@@ -9,10 +9,11 @@ use super::requests::{
 };
 use super::{SERVER_HEADER, allowed, guard, limits, live};
 use crate::control::{
-    CameraControls, Control, ControlChanges, ControlList, ControlRequest, RecordRequest, ReplayControl,
-    SeekRequest, StopRequest,
+    CalibratedImage, CameraControls, Control, ControlChanges, ControlList, ControlRequest, RecordRequest,
+    ReplayControl, SeekRequest, StopRequest,
 };
 use crate::doctor::Examined;
+use crate::losses::RecordingLosses;
 use crate::metrics;
 use crate::status::{CameraState, CameraStatus, RecordingStatus, ReplayStatus, RigStatus};
 use crate::{Error, ErrorKind};
@@ -51,11 +52,12 @@ pub struct Route {
 const CALIBRATION_EVENTS: &str = "/v1/calibration/events";
 
 /// Every call of the API.
-pub const ROUTES: [Route; 31] = [
+pub const ROUTES: [Route; 33] = [
     Route { method: "GET", path: "/v1/status", handler: || get(status) },
     Route { method: "GET", path: "/v1/health", handler: || get(health) },
     Route { method: "GET", path: "/v1/config", handler: || get(config) },
     Route { method: "GET", path: "/v1/record", handler: || get(record) },
+    Route { method: "GET", path: "/v1/record/losses", handler: || get(record_losses) },
     Route { method: "POST", path: "/v1/record/start", handler: || post(record_start) },
     Route { method: "POST", path: "/v1/record/stop", handler: || post(record_stop) },
     Route { method: "POST", path: "/v1/record/note", handler: || post(record_note) },
@@ -77,6 +79,7 @@ pub const ROUTES: [Route; 31] = [
     Route { method: "POST", path: "/v1/replay/step", handler: || post(replay_step) },
     Route { method: "POST", path: "/v1/replay/rate", handler: || post(replay_rate) },
     Route { method: "POST", path: "/v1/replay/loop", handler: || post(replay_loop) },
+    Route { method: "GET", path: "/v1/calibration", handler: || get(calibration) },
     Route { method: "GET", path: CALIBRATION_EVENTS, handler: || get(calibration_follow) },
     Route { method: "POST", path: CALIBRATION_EVENTS, handler: || post(calibration_post) },
     Route { method: "POST", path: "/v1/stop", handler: || post(stop) },
@@ -159,6 +162,10 @@ async fn config(State(rig): State<Rig>) -> Answer<Response> {
 
 async fn record(State(rig): State<Rig>) -> Answer<Json<Option<RecordingStatus>>> {
     call(rig, |rig| Ok(rig.status().recording)).await.map(Json)
+}
+
+async fn record_losses(State(rig): State<Rig>) -> Answer<Json<Option<RecordingLosses>>> {
+    call(rig, |rig| Ok(rig.record_losses())).await.map(Json)
 }
 
 async fn record_start(State(rig): State<Rig>, body: Bytes) -> Answer<Json<RecordingStatus>> {
@@ -302,6 +309,10 @@ async fn of_replay(
         what(rig.replay().ok_or_else(none)?)
     };
     call(rig, on_replay).await.map(Json)
+}
+
+async fn calibration(State(rig): State<Rig>) -> Answer<Json<Vec<CalibratedImage>>> {
+    call(rig, |rig| Ok(rig.calibration())).await.map(Json)
 }
 
 async fn calibration_post(Extension(events): Extension<Events>, body: Bytes) -> Answer<StatusCode> {

@@ -2,6 +2,7 @@
 
 use super::{Inner, lock};
 use crate::control::{Control, LiveRig, RecordRequest, ReplayControl, SeekRequest};
+use crate::losses::RecordingLosses;
 use crate::recording::{self, Begun, StreamFacts};
 use crate::rig::report;
 use crate::status::{
@@ -263,6 +264,10 @@ impl Control for Inner {
 
     fn record_note(&self, text: &str) -> Result<()> {
         lock(&self.recording).note(text)
+    }
+
+    fn record_losses(&self) -> Option<RecordingLosses> {
+        lock(&self.recording).losses()
     }
 
     fn live(&self) -> Option<LiveRig> {

@@ -4,9 +4,11 @@ use super::{Inner, controls, lock, report};
 use crate::Result;
 use crate::attached::System;
 use crate::control::{
-    CameraControls, Control, ControlChanges, ControlList, ControlRequest, LiveRig, RecordRequest, Shows,
+    CalibratedImage, CameraControls, Control, ControlChanges, ControlList, ControlRequest, LiveRig,
+    RecordRequest, Shows,
 };
 use crate::doctor::{self, Surroundings};
+use crate::losses::RecordingLosses;
 use crate::recording::{self, Begun};
 use crate::status::{RecordingStatus, RigStatus};
 use core::sync::atomic::Ordering;
@@ -41,6 +43,11 @@ impl Control for Inner {
         let around = Surroundings { root: SysRoot::new("/"), runtime: None, measure_disk: false };
         let system = System::of_rig(&self.config, Some(self.runtime.clone()));
         doctor::examine_all(&self.config, &around, &system)
+    }
+
+    fn calibration(&self) -> Vec<CalibratedImage> {
+        let entries = self.config.cameras.iter().flat_map(|camera| &camera.calibration);
+        entries.map(|c| CalibratedImage::of(&c.camera, &c.created)).collect()
     }
 
     fn controls(&self) -> Result<ControlList> {
@@ -90,6 +97,10 @@ impl Control for Inner {
 
     fn record_note(&self, text: &str) -> Result<()> {
         self.recording().note(text)
+    }
+
+    fn record_losses(&self) -> Option<RecordingLosses> {
+        self.recording().losses()
     }
 
     fn live(&self) -> Option<LiveRig> {

@@ -1,6 +1,9 @@
 //! A scripted rig.
 
-use depthrig_daemon::control::{Control, RecordRequest, ReplayControl, SeekRequest};
+use depthrig_daemon::control::{
+    CalibratedImage, Control, LossBucket, Losses, RecordRequest, RecordingLosses, ReplayControl, SeekRequest,
+    UncertaintyOfImage,
+};
 use depthrig_daemon::status::{
     CameraState, CameraStatus, ClockStatus, PreparingStatus, RecordingStatus, RefineState, RefineStatus,
     ReplayStatus, RigStatus, SetAccount, SetStatus, SharedMemoryStatus, StreamStatus,
@@ -210,6 +213,8 @@ impl Control for Fake {
             active: true,
             scene: request.scene.clone(),
             dropped: [("backlog_full".to_owned(), 1)].into(),
+            missing: [("front/color".to_owned(), 2)].into(),
+            frames_dropped: [("no_slot".to_owned(), 2)].into(),
             ..RecordingStatus::default()
         };
         (inner.request, inner.recording) = (Some(request.clone()), Some(status.clone()));
@@ -234,6 +239,33 @@ impl Control for Fake {
         }
         inner.notes.push(text.to_owned());
         Ok(())
+    }
+
+    fn calibration(&self) -> Vec<CalibratedImage> {
+        let uncertainty = UncertaintyOfImage {
+            distance_m: 0.8,
+            pixel_mm: 1.3,
+            columns: 2,
+            sigma_px: vec![Some(0.2), None],
+            middle_px: 0.2,
+            worst_px: 0.2,
+        };
+        let image = |stream: &str, uncertainty| CalibratedImage {
+            stream: stream.into(),
+            created: "2026-11-25T03:00:00Z".into(),
+            width: 640,
+            height: 480,
+            uncertainty,
+        };
+        vec![image("front/color", Some(uncertainty)), image("left/color", None)]
+    }
+
+    fn record_losses(&self) -> Option<RecordingLosses> {
+        let recording = self.inner.lock().unwrap().recording.clone()?;
+        let losses =
+            Losses { sets: recording.dropped, missing: recording.missing, frames: recording.frames_dropped };
+        let buckets = vec![LossBucket { from_s: 4.0, losses }];
+        Some(RecordingLosses { path: recording.path, duration_s: 7.5, bucket_s: 2.0, buckets })
     }
 
     fn request_stop(&self) {

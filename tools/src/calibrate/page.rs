@@ -178,7 +178,7 @@ fn maps(out: &mut String, camera: &CameraResult, in_file: &CalibratedCamera) {
     let uncertainty = Map {
         title: format!(
             "Uncertainty of projection at {:.2} m: {:.2} px in the middle, at most {:.2} px; red is {STRONG_PX} px",
-            camera.distance_m,
+            sigma.distance_m,
             sigma.middle_px(),
             sigma.worst_px()
         ),

@@ -42,6 +42,11 @@ fn file() -> Calibration {
             halves_differ_mm: None,
             halves_differ_deg: None,
         },
+        uncertainty: (name == "right").then(|| UncertaintyMap {
+            distance_m: 0.8,
+            columns: 2,
+            sigma_px: vec![0.3, 0.2, 0.0625, 0.4],
+        }),
         latency: (name == "right").then(|| FileLatency {
             latency_ms: 4.7,
             sigma_ms: 0.02,
@@ -124,6 +129,21 @@ fn bad_files_are_refused() {
     let twice = Calibration { depth: vec![correction(), correction()], ..file() };
     let message = Calibration::from_toml(&twice.to_toml().unwrap()).unwrap_err().to_string();
     assert!(message.contains("depth of left/depth is there twice"), "{message}");
+}
+
+#[test]
+fn a_map_of_uncertainty_is_a_grid_and_may_have_gaps() {
+    let mut calibration = file();
+    let map = calibration.cameras[1].uncertainty.as_mut().unwrap();
+    map.sigma_px[2] = f64::NAN;
+    let read = Calibration::from_toml(&calibration.to_toml().unwrap()).unwrap();
+    let read = read.cameras[1].uncertainty.as_ref().unwrap();
+    assert!(read.sigma_px[2].is_nan() && read.sigma_px[3] == 0.4, "{read:?}");
+    for columns in [0, 3] {
+        calibration.cameras[1].uncertainty.as_mut().unwrap().columns = columns;
+        let error = Calibration::from_toml(&calibration.to_toml().unwrap()).unwrap_err().to_string();
+        assert!(error.contains("camera right: uncertainty"), "{error}");
+    }
 }
 
 #[test]

@@ -198,7 +198,7 @@ impl<'a> Json<'a> {
                     outliers: c.outliers,
                     coverage: &c.coverage.corners,
                     coverage_columns: c.coverage.columns,
-                    distance_m: c.distance_m,
+                    distance_m: c.uncertainty.distance_m,
                     uncertainty_px: &c.uncertainty.sigma_px,
                     uncertainty_columns: c.uncertainty.columns,
                     halves_differ_most_px: c
