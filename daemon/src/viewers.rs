@@ -117,12 +117,12 @@ struct Viewer {
     credits: u32,
     questions: Vec<PixelQuestion>,
     to: mpsc::Sender<Message>,
-    /// Messages that found no room, since it was last told so.
+    /// Messages that found no room, since their number was last reported to it.
     lost: u64,
 }
 
 impl Viewer {
-    /// Sends a message if it reads what is sent to it. What had no room it is told with the next message that has. Whether it was sent.
+    /// Sends a message if there is room, and before it the number of those that found none. Returns whether it was sent.
     fn put(&mut self, message: Message) -> bool {
         if self.lost > 0 {
             let text = format!("{} messages were lost: they come faster than this page reads", self.lost);

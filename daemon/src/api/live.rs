@@ -31,7 +31,7 @@ const MAX_MESSAGE_BYTES: usize = 16 << 10;
 const SILENCE: Duration = Duration::from_secs(20);
 const PING_PERIOD: Duration = Duration::from_secs(5);
 
-/// What a control frame holds beside its code (RFC 6455).
+/// Bytes that a closing frame holds beside its code (RFC 6455).
 const MAX_REASON_BYTES: usize = 123;
 
 /// Reasons for which the server closes; 4000 and more are an application's own (RFC 6455).

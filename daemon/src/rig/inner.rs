@@ -1,4 +1,4 @@
-//! What the rig's threads ask of their shared state.
+//! Questions of the rig's threads to their shared state.
 
 use super::{Inner, SetAccounts, join};
 use crate::recording::{Recording, StreamFacts};
