@@ -45,7 +45,7 @@ HOLE = Patch(0.75, 0.75, (128, 128, 128), 0)
 PATCHES = (NEAR, FAR, MIDDLE, HOLE)
 
 MANIFEST = """model = "pattern"
-rate_hz = {rate_hz}
+rate_hz = 10.0
 """
 STREAM = """
 [[stream]]
@@ -100,7 +100,7 @@ def pattern(folder: Path, width: int = WIDTH, height: int = HEIGHT, rate_hz: flo
     Image.fromarray(depth).save(folder / "depth_1.png")
     manifest = folder / "camera.toml"
     streams = STREAM.format(name="color", more="") + STREAM.format(name="depth", more="depth_unit_m = 0.001\n")
-    manifest.write_text(MANIFEST.format(rate_hz=rate_hz) + streams)
+    manifest.write_text(MANIFEST.replace("10.0", str(rate_hz)) + streams)
     return manifest
 
 

@@ -54,7 +54,7 @@ def restless(folder: Path) -> Path:
         Image.fromarray(np.full((HEIGHT, WIDTH), 1000 + i * STEP_MM, np.uint16)).save(folder / f"depth_{i}.png")
     manifest = folder / "camera.toml"
     depth = STREAM.format(name="depth", more="depth_unit_m = 0.001\n")
-    manifest.write_text(MANIFEST.format(rate_hz=10.0) + STREAM.format(name="color", more="") + depth)
+    manifest.write_text(MANIFEST + STREAM.format(name="color", more="") + depth)
     return manifest
 
 

@@ -345,8 +345,10 @@ def test_a_recording_that_was_removed_meanwhile_leaves_the_list(wall: Wall, rig:
     panel = open_panel(wall, "l", "Recordings")
     entry = row(wall, name)
     entry.wait_for()
+    bad = button(entry, "Bad").element_handle()
     shutil.rmtree(folder / "datasets" / name)
-    button(entry, "Bad").click()
+    # Whether or not the list was refreshed meanwhile.
+    bad.evaluate("button => button.click()")
     wait_for_text(panel, f"{name} was not marked")
     until(lambda: row(wall, name).count() == 0)
 
