@@ -17,7 +17,7 @@ cmp "$unpacked"/wheel/depthrig-*.data/scripts/depthrig "$unpacked/deb/usr/bin/de
 allowed='^(ld-linux-.*\.so\.[0-9]|libc\.so\.6|libdl\.so\.2|libm\.so\.6|libpthread\.so\.0|libusb-1\.0\.so\.0)$'
 checked=0
 while IFS= read -r -d '' file; do
-    [ "$(head --bytes=4 "$file")" = $'\x7fELF' ] || continue
+    [ "$(head --bytes=4 "$file" | tail --bytes=3 | tr --delete "\0")" = ELF ] || continue
     checked=$((checked + 1))
     name=${file#"$unpacked"/}
     needed=$(readelf --dynamic --wide "$file" | sed -nE 's/.*\(NEEDED\).*\[(.*)\]/\1/p' | sort)
@@ -37,8 +37,10 @@ while IFS= read -r -d '' file; do
         exit 1
     fi
     for path in "$PWD" "${CARGO_HOME:-$HOME/.cargo}"; do
-        if strings --all "$file" | grep --fixed-strings --max-count=3 "$path" >&2; then
-            echo "$name holds paths below $path" >&2
+        # Read to the end: a reader that stops early ends `strings` with SIGPIPE, which pipefail takes for "not found".
+        leaked=$(strings --all "$file" | grep --fixed-strings "$path" || true)
+        if [ -n "$leaked" ]; then
+            echo "$name holds paths below $path: $(sed -n 1,3p <<<"$leaked")" >&2
             exit 1
         fi
     done

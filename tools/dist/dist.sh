@@ -4,7 +4,7 @@
 #
 #   tools/dist/dist.sh [x86_64] [aarch64]
 #
-# A build takes 14 CPU minutes for each architecture; what is built lies in target/dist.
+# A build takes 10 CPU minutes for each architecture; what is built lies in target/dist.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 # Packages hold the permissions of their files.
