@@ -79,7 +79,7 @@ ARCH ?= x86_64 aarch64
 dist: setup-dist ## the wheel and the Debian package of each architecture, into dist/: make dist ARCH=x86_64
 	tools/dist/dist.sh $(ARCH)
 
-test-dist: setup-dist ## the packages in dist/ installed in a clean Debian 12 and 13, as root; the binary for aarch64 in QEMU
+test-dist: setup-dist $(VENV)/.stamp ## the packages in dist/ in a clean Debian 12 and 13, as root, and by the tutorial; the binary for aarch64 in QEMU
 	tests/dist/run $(ARGS)
 
 bench: setup-build ## the numbers of docs/performance.md

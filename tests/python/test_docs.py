@@ -12,7 +12,6 @@ import shlex
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from page import CHROMIUM, SIMULATED, opened, until
 from playwright.sync_api import sync_playwright
 from test_daemon import ROOT, WAIT_S, binary, command, environment, running, runtime
 from test_page import address, save_screenshot
+from tutorial import TUTORIAL, Commands, blocks, leave, record, shell, watch
 
 sys.path.insert(0, str(ROOT / "tools" / "docs"))
 import links
@@ -29,20 +29,8 @@ import reference
 __all__ = ["binary", "runtime"]
 
 MDBOOK = ROOT / ".venv-docs" / "bin" / "mdbook"
-FENCE = re.compile(r"^( *)```(\w+)\n(.*?)^ *```$", re.MULTILINE | re.DOTALL)
 CODES = (0, 3)
 """Frames may be lost on a small computer; that is not a matter of the documents."""
-
-
-def blocks(path: Path, language: str) -> list[str]:
-    """Examples of a document in one language."""
-    found = FENCE.findall(path.read_text())
-    return [re.sub(f"(?m)^{indent}", "", text) for indent, name, text in found if name == language]
-
-
-def shell(path: Path) -> list[str]:
-    """Commands of a document's examples, without comments."""
-    return [line for text in blocks(path, "sh") for line in (re.sub(r"\s+#.*", "", raw) for raw in text.splitlines()) if line]
 
 
 @pytest.fixture(scope="module")
@@ -176,14 +164,8 @@ def bench(binary: str, tmp_path: Path) -> Path:
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium; tools/setup.sh test installs it")
 def test_the_tutorial_leads_to_a_dataset(binary: str, bench: Path, runtime: Path) -> None:
-    tutorial = ROOT / "docs" / "tutorial.md"
-    left = shell(tutorial)
-
-    def take(start: str) -> str:
-        """A command of the tutorial, which is crossed off."""
-        found = next(line for line in left if line.startswith(start))
-        left.remove(found)
-        return found
+    commands = Commands()
+    take = commands.take
 
     def sh(line: str, codes: tuple[int, ...] = (0,)) -> str:
         where = {**environment(runtime), "PATH": f"{bench / 'bin'}:{os.environ['PATH']}"}
@@ -199,11 +181,11 @@ def test_the_tutorial_leads_to_a_dataset(binary: str, bench: Path, runtime: Path
         return done.stdout
 
     # One image of each scene instead of twelve: the rest of the rendering shows nothing new.
-    rig = blocks(tutorial, "toml")[0].replace("model =", "poses = 1\nmodel =")
+    rig = blocks(TUTORIAL, "toml")[0].replace("backend =", "poses = 1\nbackend =")
     (bench / "first.toml").write_text(f"{rig}\n[recording]\ndirectory = {json.dumps(str(bench / 'datasets'))}\nreserve_mb = 64\n")
     sh(take("depthrig --version"))
     sh(take("depthrig config check"))
-    replayed, live = blocks(tutorial, "python")
+    replayed, live = blocks(TUTORIAL, "python")
     with running(binary, runtime, bench / "log", *shlex.split(take("depthrig run"))[1:2], str(bench / "first.toml"), codes=CODES):
         where = address(binary, runtime, "first")
         until(lambda: json.loads(sh("depthrig status --json", CODES))["preparing"] is None)
@@ -214,22 +196,9 @@ def test_the_tutorial_leads_to_a_dataset(binary: str, bench: Path, runtime: Path
             with opened(browser, where) as wall:
                 take("depthrig open")
                 wall.wait_for_image("front/color", "front/depth", "left/color", "left/depth")
-                wall.page.fill("#scene", "kitchen")
-                wall.page.keyboard.press("Escape")
-                wall.page.keyboard.press("Space")
-                wall.wait_for_state("#record-state", "recording")
-                time.sleep(3)
-                save_screenshot(wall, "tutorial")
-                wall.page.keyboard.press("Space")
-                wall.wait_for_state("#record-state", "idle")
-                # The recording takes the place of the cameras, and gives it back.
-                wall.page.keyboard.press("l")
-                wall.page.get_by_role("button", name="Watch").first.click()
-                wall.page.wait_for_selector("#replay:not([hidden])")
-                wall.wait_for_image("front/color")
-                wall.page.keyboard.press("Escape")
-                wall.page.keyboard.press("Escape")
-                wall.page.wait_for_selector("#replay", state="hidden")
+                record(wall, 3, lambda: save_screenshot(wall, "tutorial"))
+                watch(wall, "front/color")
+                leave(wall)
             browser.close()
         sh(take("depthrig record start").replace("10s", "2s").replace("kitchen", "again"), CODES)
         until(lambda: json.loads(sh("depthrig record status --json", CODES)).get("active") is not True)
@@ -241,8 +210,8 @@ def test_the_tutorial_leads_to_a_dataset(binary: str, bench: Path, runtime: Path
     dataset = next((bench / "datasets").glob("*_kitchen"))
     assert take("depthrig replay") == "depthrig replay datasets/*_kitchen --loop"
     with running(binary, runtime, bench / "replay", "replay", str(dataset), "--loop", codes=CODES):
-        assert python(replayed).count("(720, 1280)") == 5
+        assert python(replayed).count("(480, 640)") == 5
     sh(take("depthrig cameras"))
     sh(take("depthrig doctor"), (0, 1, 3))
     # Not tried here: the second window, installing, and what watches a terminal (tests of their own).
-    assert sorted(line.split()[1] for line in left if line.startswith("depthrig")) == ["install", "open", "top"]
+    assert sorted(line.split()[1] for line in commands.left if line.startswith("depthrig")) == ["install", "open", "top"]

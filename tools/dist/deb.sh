@@ -5,10 +5,13 @@
 #   tools/dist/deb.sh --tree BINARY GENERATOR OUT  only the files of the package, as a tree below OUT
 #
 # GENERATOR is a binary of the same version that runs on this computer: it writes manual pages and completions.
+# DEPTHRIG_MAINTAINER ("Name <address>") is who answers for the package: set it to publish one.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 arch=$1 binary=$2 generator=$(realpath "$3") out=$4
 version=$(tools/dist/value.py version)-1
+# The domain is reserved (RFC 2606): mail to it reaches nobody.
+maintainer=${DEPTHRIG_MAINTAINER:-depthrig authors <authors@depthrig.invalid>}
 SOURCE_DATE_EPOCH=$(tools/dist/value.py epoch)
 export SOURCE_DATE_EPOCH
 
@@ -51,7 +54,7 @@ depthrig ($version) unstable; urgency=medium
 
   * Built from the sources of depthrig; changelog.gz lists what changed.
 
- -- depthrig maintainers <maintainers@depthrig.invalid>  $(date --utc --rfc-email --date="@$SOURCE_DATE_EPOCH")
+ -- $maintainer  $(date --utc --rfc-email --date="@$SOURCE_DATE_EPOCH")
 LOG
     # Paragraphs of the licence, as the format of this file wants them.
     local mit
@@ -82,8 +85,10 @@ chmod 0755 "$tree"
 umask 022
 fill
 mkdir "$tree/DEBIAN"
-size=$(du --summarize --apparent-size --block-size=1024 --exclude=DEBIAN "$tree" | cut -f1)
-sed -e "s/@VERSION@/$version/" -e "s/@ARCH@/$debian/" -e "s/@SIZE@/$size/" \
+# As dpkg counts: a folder is 1 KiB, whatever the file system gives it.
+size=$(find "$tree" -path "$tree/DEBIAN" -prune -o -type f -printf '%s\n' -o -printf '1\n' |
+    awk '{kib += int(($1 + 1023) / 1024)} END {print kib}')
+sed -e "s/@VERSION@/$version/" -e "s/@ARCH@/$debian/" -e "s/@SIZE@/$size/" -e "s/@MAINTAINER@/$maintainer/" \
     -e "s/@GLIBC@/$(tools/dist/value.py glibc)/" tools/dist/debian/control >"$tree/DEBIAN/control"
 for script in postinst postrm; do install --mode=0755 "tools/dist/debian/$script" "$tree/DEBIAN/$script"; done
 (cd "$tree" && find usr -type f -print0 | LC_ALL=C sort --zero-terminated | xargs --null md5sum) >"$tree/DEBIAN/md5sums"

@@ -4,9 +4,11 @@
 #
 #   tools/dist/dist.sh [x86_64] [aarch64]
 #
-# A build takes 14 CPU minutes for each architecture; what is built lies in target/dist.
+# A build takes 10 CPU minutes for each architecture; what is built lies in target/dist.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
+# Packages hold the permissions of their files.
+umask 022
 work=target/dist
 [ $# -gt 0 ] || set -- x86_64 aarch64
 
@@ -28,15 +30,15 @@ for arch in "$@"; do
     out=$work/out/$arch
     rm -rf "$out"
     tools/dist/wheel.sh "$arch" "$out"
-    tools/dist/check_wheel.sh "$arch" "$out"
     # A program of this computer writes pages and completions, which are the same for every architecture.
     generator=$work/out/$host/depthrig
     if [ ! -x "$generator" ]; then
         echo "manual pages need the binary of this computer: make dist ARCH='$host $arch'" >&2
         exit 1
     fi
-    tools/dist/deb.sh "$arch" "$out/depthrig" "$generator" dist
-    cp "$out"/depthrig-*.whl dist/
+    tools/dist/deb.sh "$arch" "$out/depthrig" "$generator" "$out"
+    tools/dist/check.sh "$out"/depthrig-*.whl "$out"/depthrig_*.deb
+    cp "$out"/depthrig-*.whl "$out"/depthrig_*.deb dist/
     cp "$out/depthrig.cdx.json" "dist/depthrig-$version-$arch.cdx.json"
 done
 (cd dist && find . -maxdepth 1 -type f ! -name SHA256SUMS -printf '%P\0' | LC_ALL=C sort --zero-terminated |
