@@ -76,7 +76,7 @@ class DataConfig:
 
 @dataclass(frozen=True)
 class SynthesisConfig:
-    """Raw depth made from true depth, for datasets without a sensor, and noise added to both."""
+    """Raw depth made from true depth, for datasets without a sensor."""
 
     sensor: str = "none"
     """`none` (raw depth as the dataset has it), `stereo` or `tof`."""
