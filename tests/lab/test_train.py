@@ -210,8 +210,13 @@ def test_what_cannot_be_trained_is_refused(tmp_path: Path, capsys: pytest.Captur
     rng = np.random.default_rng(0)
     with pytest.raises(LabError, match="no raw depth; set sensor"):
         batches.example(dataclasses.replace(bare, raw=None), read, rng)
-    with pytest.raises(LabError, match="no true depth"):
-        batches.example(dataclasses.replace(bare, truth=None), read, rng)
+    blind = dataclasses.replace(bare, truth=None)
+    read = dataclasses.replace(read, train=config.TrainConfig(crop=(28, 28)), model=config.ModelConfig(kind="cdm"))
+    of_holes = dataclasses.replace(read, model=config.ModelConfig(kind="hole"))
+    for c in (read, dataclasses.replace(read, model=config.ModelConfig(kind="hole", refined_input=True))):
+        with pytest.raises(LabError, match="no true depth"):
+            batches.example(blind, c, rng)
+    assert not batches.example(blind, of_holes, rng).planes["truth"].any()
 
 
 def test_each_sample_comes_once_in_an_epoch(tmp_path: Path) -> None:

@@ -64,8 +64,8 @@ def example(sample: Sample, config: Config, rng: np.random.Generator) -> Example
     if sample.color.shape[0] < height or sample.color.shape[1] < width:
         found = f"{sample.color.shape[1]}x{sample.color.shape[0]}"
         raise LabError(f"{sample.name}: {found} is smaller than the crop of {width}x{height}; choose a smaller crop")
-    refines = config.model.kind in ("tiny", "cdm")
-    truth = sample.need_truth() if refines else sample.truth
+    needs_truth = config.model.kind in ("tiny", "cdm") or config.model.refined_input
+    truth = sample.need_truth() if needs_truth else sample.truth
     raw = raw_of(sample, config, rng)
     y = int(rng.integers(sample.color.shape[0] - height + 1))
     x = int(rng.integers(sample.color.shape[1] - width + 1))

@@ -82,6 +82,10 @@ class SynthesisConfig:
     """`none` (raw depth as the dataset has it), `stereo` or `tof`."""
     focal_baseline: float = 30.0
     """Focal length times baseline of the stereo sensor, pixels times metres, at a width of 640."""
+    value: str | None = None
+    """`make_shards`: state of the camera's value model, of `model.encoder`."""
+    hole: str | None = None
+    """The same of its hole model."""
     strength: float = 1.0
     """Factor of every high-frequency noise; 0 is none."""
 
@@ -295,4 +299,12 @@ def read(path: str | Path) -> Config:
     weights = config.model.weights
     model = dataclasses.replace(config.model, weights=weights and str(base / weights))
     data, check = tuple(map(moved, config.data)), tuple(map(moved, config.check))
-    return dataclasses.replace(config, folder=str(base / config.folder), data=data, check=check, model=model)
+    synthesis = config.synthesis
+    synthesis = dataclasses.replace(
+        synthesis,
+        value=synthesis.value and str(base / synthesis.value),
+        hole=synthesis.hole and str(base / synthesis.hole),
+    )
+    return dataclasses.replace(
+        config, folder=str(base / config.folder), data=data, check=check, model=model, synthesis=synthesis
+    )

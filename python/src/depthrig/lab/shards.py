@@ -35,7 +35,7 @@ MEMBERS_MAX = 1 << 28
 """Larger members are refused."""
 NAME = re.compile(r"(?P<key>\d{10})\.(?P<what>color\.png|truth\.png|raw\.png|material\.png|json)")
 OURS = "MIT OR Apache-2.0"
-SHIPPING = {OURS, "MIT", "Apache-2.0", "BSD-3-Clause", "CC0-1.0", "CC-BY-4.0"}
+SHIPPING = {OURS, "MIT", "Apache-2.0", "BSD-3-Clause", "CC0-1.0", "CC BY 4.0", "CC BY-SA 3.0", "your own recordings"}
 """Licences of shards under which a model may ship."""
 
 
@@ -84,25 +84,22 @@ class Shard:
         self.path = path
         self.entries: list[Entry] = []
         try:
-            size = path.stat().st_size
             with path.open("rb") as file:
-                self._scan(file, size)
+                self._scan(file)
         except OSError as e:
             raise LabError(f"{path}: {e}") from None
         if not self.entries:
             raise LabError(f"{path}: no samples")
 
-    def _scan(self, file: BinaryIO, size: int) -> None:
+    def _scan(self, file: BinaryIO) -> None:
         open_entry: Entry | None = None
         known = set()
         while (header := _header(file, self.path)) is not None:
             at = file.tell()
             if header.size > MEMBERS_MAX or header.size < 0:
                 raise LabError(f"{self.path}: {header.name} has {header.size} bytes; at most {MEMBERS_MAX} are read")
-            ends = at + -(-header.size // BLOCK) * BLOCK
-            if ends > size:
-                raise LabError(f"{self.path}: cut short within {header.name}; make this shard again")
-            file.seek(ends)
+            # Beyond the end of a cut file the next header is missing.
+            file.seek(at + -(-header.size // BLOCK) * BLOCK)
             if not header.isreg():
                 continue
             match = NAME.fullmatch(header.name)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import importlib.util
 import io
 import warnings
 from pathlib import Path
 
 import torch
 
+from ..errors import LabError
 from ..record import write_atomically
 from .tiny import CHANNELS, MULTIPLE, Tiny
 
@@ -17,7 +19,12 @@ OPSET = 17
 
 
 def export_tiny(net: Tiny, path: Path) -> None:
-    """Write the network: inputs `x` (batch, 6, height, width) and `filled` (batch, height, width), output `refined`."""
+    """Write the network: inputs `x` (batch, 6, height, width) and `filled` (batch, height, width), output `refined`.
+
+    :raises LabError: when the package `onnx`, which PyTorch exports with, is not installed.
+    """
+    if importlib.util.find_spec("onnx") is None:
+        raise LabError(f"{path}: not written: pip install onnx")
     height, width = 4 * MULTIPLE, 6 * MULTIPLE
     example = (torch.zeros(1, CHANNELS, height, width), torch.ones(1, height, width))
     axes = {0: "batch", 1: "height", 2: "width"}
