@@ -23,6 +23,7 @@ torch = pytest.importorskip("torch", reason="PyTorch is not installed")
 from depthrig.lab import LabError, batches, config, losses, metrics, train
 from depthrig.lab.data import open_source
 from depthrig.lab.fill import fill
+from depthrig.lab.nets.vit import SIZES, Size
 from depthrig.lab.sample import MATERIALS
 from depthrig.lab.shards import ShardWriter
 
@@ -202,6 +203,8 @@ def test_what_cannot_be_trained_is_refused(tmp_path: Path, capsys: pytest.Captur
     checkpoint = tmp_path / "kept/checkpoint.pt"
     checkpoint.write_bytes(checkpoint.read_bytes()[:500])
     refused(make_config(tmp_path, "kept", steps=3), "checkpoint.pt: damaged checkpoint")
+    checkpoint.write_bytes(b"")
+    refused(path, "checkpoint.pt: damaged checkpoint")
     torch.save({"step": 1}, checkpoint)
     refused(path, "not a checkpoint")
     refused(tmp_path / "none.toml", "none.toml")
@@ -415,3 +418,33 @@ def test_schedules() -> None:
     assert one[-1] < 0.01
     assert rates(schedule="cosine", warmup=10)[:10] == pytest.approx([(i + 1) / 10 for i in range(10)])
     assert set(rates(schedule="constant")) == {1.0}
+
+
+def test_each_kind_of_model_trains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    small = Size(24, 4, 2, (0, 1, 2, 3), 16, (8, 16, 24, 32))
+    monkeypatch.setitem(SIZES, "vits", small)
+    path = make_config(tmp_path, steps=3, crop=[28, 42], rate=1e-3, head_rate=10.0)
+    for i, (kind, more) in enumerate((("cdm", ""), ("hole", ""), ("value", ""), ("value", "refined_input = true\n"))):
+        text = path.read_text().replace("[model]\nwidth = 8\n", f'[model]\nkind = "{kind}"\n{more}')
+        read = config.parse(text.replace("[train]\n", f"[train]\nbf16 = {str(i == 0).lower()}\n"))
+        data = dataclasses.replace(read.data[0], path=str(tmp_path / "data"))
+        folder = train.run(dataclasses.replace(read, folder=str(tmp_path / f"{i}"), data=(data,), check=(data,)))
+        first = lines(folder)[0]
+        assert json.loads(first)["loss"] > 0
+        found = json.loads((folder / "metrics.json").read_text())
+        assert bool(found) == (kind == "cdm")
+        # Encoders learn more slowly than the rest.
+        net = train._Trainer(read, folder, [open_source(data)], [])
+        rates = {g["factor"]: len(g["params"]) for g in net.optimizer.param_groups}
+        assert set(rates) == {1.0, 10.0}
+        assert net.step == 3
+
+
+def test_raw_depth_is_made_where_there_is_none(tmp_path: Path) -> None:
+    read = config.parse(make_config(tmp_path).read_text() + '\n[synthesis]\nsensor = "stereo"\nfocal_baseline = 3.0\n')
+    bare = dataclasses.replace(sample(0, 40, 56), raw=None)
+    made = [batches.raw_of(bare, read, np.random.default_rng(seed)) for seed in (1, 1, 2)]
+    np.testing.assert_array_equal(made[0], made[1])
+    assert not np.array_equal(made[0], made[2])
+    own = sample(0, 40, 56)
+    assert batches.raw_of(own, read, np.random.default_rng(1)) is own.raw

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from .errors import LabError
+from .errors import LabError, first_line
 from .record import fsync_folder
 
 __all__ = ["load", "save"]
@@ -29,9 +29,7 @@ def save(path: Path, state: Any) -> None:
         part.replace(path)
     except (OSError, RuntimeError) as e:
         part.unlink(missing_ok=True)
-        raise LabError(
-            f"{path}: not written: {str(e).splitlines()[0]}; the last one is kept; is the disk full?"
-        ) from None
+        raise LabError(f"{path}: not written: {first_line(e)}; the last one is kept; is the disk full?") from None
     except BaseException:
         part.unlink(missing_ok=True)
         raise
@@ -46,7 +44,7 @@ def load(path: Path) -> dict[str, Any]:
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, RuntimeError, EOFError, ValueError, pickle.UnpicklingError) as e:
-        raise LabError(f"{path}: damaged checkpoint: {str(e).splitlines()[0]}; remove it to begin again") from None
+        raise LabError(f"{path}: damaged checkpoint: {first_line(e)}; remove it to begin again") from None
     if not isinstance(state, dict) or not {"step", "model", "optimizer", "ema"} <= state.keys():
         raise LabError(f"{path}: not a checkpoint of this program; remove it to begin again")
     return state

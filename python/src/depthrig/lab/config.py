@@ -6,6 +6,7 @@ Every key is checked: an unknown one, a value of the wrong type or out of range 
 from __future__ import annotations
 
 import dataclasses
+import platform
 import re
 import types
 import typing
@@ -266,8 +267,10 @@ def parse(text: str, name: str = "configuration") -> Config:
 
     :raises LabError: when it is not TOML, or a key or value is invalid; names `name` and the line.
     """
-    import tomllib  # Python 3.11; the rest of the package runs on older ones
-
+    try:
+        import tomllib
+    except ImportError:
+        raise LabError(f"depthrig.lab needs Python 3.11 or later; this is {platform.python_version()}") from None
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as e:

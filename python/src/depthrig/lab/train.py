@@ -26,7 +26,7 @@ from . import checkpoint, losses, metrics
 from .batches import Batches, loader, raw_of
 from .config import Config, DataConfig, read
 from .data import Source, open_source
-from .errors import LabError
+from .errors import LabError, first_line
 from .fill import fill
 from .nets import build
 from .nets.cdm import normalise_color
@@ -105,7 +105,9 @@ class _Trainer:
         if self.config.train.device == "cuda":
             if not torch.cuda.is_available():
                 raise LabError('device = "cuda", but PyTorch finds no GPU; use device = "cpu"')
-            return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
+            device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
+            torch.cuda.set_device(device)
+            return device
         return torch.device("cpu")
 
     @property
@@ -120,7 +122,7 @@ class _Trainer:
             self.net.load_state_dict(state["model"])
             self.optimizer.load_state_dict(state["optimizer"])
         except (RuntimeError, ValueError, KeyError) as e:
-            raise LabError(f"{self.checkpoint}: of another network: {str(e).splitlines()[0]}") from None
+            raise LabError(f"{self.checkpoint}: of another network: {first_line(e)}") from None
         self.ema = {n: v.to(self.device) for n, v in state["ema"].items()}
         self.step = int(state["step"])
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from ..config import ModelConfig
-from ..errors import LabError
+from ..errors import LabError, first_line
 from .cdm import Cdm
 from .noise import NoiseNet
 from .tiny import Tiny
@@ -42,7 +42,7 @@ def load_weights(net: Any, path: Path) -> list[str]:
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, RuntimeError, pickle.UnpicklingError, EOFError, ValueError) as e:
-        raise LabError(f"{path}: not a file of torch.save: {str(e).splitlines()[0]}") from None
+        raise LabError(f"{path}: not a file of torch.save: {first_line(e)}") from None
     if isinstance(state, dict) and isinstance(state.get("model"), dict):
         state = state["model"]
     if not isinstance(state, dict) or not all(torch.is_tensor(v) for v in state.values()):
