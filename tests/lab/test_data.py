@@ -346,11 +346,19 @@ def test_bytecameradepth_as_depthrig_exports_it(tmp_path: Path) -> None:
     folder = tmp_path / "20260314_1512/camera_d455"
     make_bytes(folder, 1.5, 1e-4)
     stream = {"folder": "camera_d455", "prefix": "depth", "ending": "png", "depth_unit_m": 1e-4}
-    stream["intrinsics"] = {"fx": 30.0, "fy": 30.0, "cx": 16.0, "cy": 12.0, "coeffs": [0] * 8, "model": 0}
+    stream["intrinsics"] = {
+        "fx": 30.0,
+        "fy": 30.0,
+        "cx": 16.0,
+        "cy": 12.0,
+        "coeffs": [0.1, 0.0],
+        "model": "brown_conrady",
+    }
     (folder.parent / "calibration.json").write_text(json.dumps({"format": "x", "streams": [stream]}))
     got = open_("bytecameradepth", tmp_path)[0]
     assert got.raw[5, 5] == np.float32(1.5)
-    assert got.need_intrinsics("x").fx == 30
+    lens = got.need_intrinsics("x")
+    assert (lens.fx, lens.model, lens.coeffs) == (30, "brown_conrady", (0.1, 0))
     (folder.parent / "calibration.json").write_text("{")
     with pytest.raises(LabError, match=r"calibration\.json"):
         open_("bytecameradepth", tmp_path)

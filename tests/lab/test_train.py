@@ -405,6 +405,10 @@ def test_filling_keeps_what_was_measured_and_leaves_no_hole() -> None:
     np.testing.assert_allclose(fill(lone), 0.7, rtol=1e-6)
 
 
+def test_nan_is_null_in_json() -> None:
+    assert train._without_nan({"a": {"b": math.nan, "c": 1.5}, "d": 2}) == {"a": {"b": None, "c": 1.5}, "d": 2}
+
+
 def test_schedules() -> None:
     def rates(**options: Any) -> list[float]:
         base = config.Config("a", "b", (config.DataConfig("shards", "x"),))

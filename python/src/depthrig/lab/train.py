@@ -248,8 +248,16 @@ class _Trainer:
         found = self.check()
         if found:
             print(metrics.table(found))
-        text = json.dumps({n: dataclasses.asdict(m) for n, m in found.items()}, indent=1, ensure_ascii=False)
+        numbers = _without_nan({n: dataclasses.asdict(m) for n, m in found.items()})
+        text = json.dumps(numbers, indent=1, ensure_ascii=False, allow_nan=False)
         write_atomically(self.folder / "metrics.json", (text + "\n").encode())
+
+
+def _without_nan(value: Any) -> Any:
+    """The same with NaN as None: JSON has no NaN."""
+    if isinstance(value, dict):
+        return {k: _without_nan(v) for k, v in value.items()}
+    return None if isinstance(value, float) and math.isnan(value) else value
 
 
 class _Log:

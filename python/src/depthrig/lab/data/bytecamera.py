@@ -95,7 +95,8 @@ class ByteCameraDepth(Source):
         if not isinstance(found, dict) or not found.get("fx"):
             return None
         fx, fy, cx, cy = (float(found[k]) for k in ("fx", "fy", "cx", "cy"))
-        return Intrinsics(fx, fy, cx, cy)
+        coeffs = tuple(float(c) for c in found.get("coeffs") or ())
+        return Intrinsics(fx, fy, cx, cy, str(found.get("model", "none")), coeffs)
 
     @staticmethod
     def _depths(folder: Path) -> list[tuple[int, Path]]:
