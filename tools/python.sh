@@ -4,6 +4,7 @@
 #   tools/python.sh environments   the environments of the tests below
 #   tools/python.sh versions   types, then the wheel's tests on every Python from 3.9 on that this computer has
 #   tools/python.sh torch      the tests that need PyTorch, with that of .venv-lerobot; 77 when it is not there
+#   tools/python.sh lab        the tests of depthrig.lab, with the same PyTorch; 77 when it is not there
 #   tools/python.sh oak        the OAK bridge with the vendor's SDK in .venv-oak: tests, and types against its stubs; 77
 #                              when it is not there
 #
@@ -100,22 +101,33 @@ print("==", sys.version.split()[0], "from", folder.relative_to(sys.prefix))' &&
             --rootdir "$root/python" -p no:cacheprovider "$root/python/tests"
 }
 
-torch() {
-    local python=$PWD/.venv-lerobot/bin/python
+with_torch() { # NAME TEST...: tests with the PyTorch of .venv-lerobot and python/requirements-NAME.txt
+    local name=$1 python=$PWD/.venv-lerobot/bin/python
+    shift
     if ! "$python" -c 'import torch' 2>/dev/null; then
         echo "PyTorch is not in .venv-lerobot; make test puts it there"
         return 77
     fi
     # Beside PyTorch's environment, not into it: that one is LeRobot's, version by version.
-    if [ ! -e "$envs/beside-torch/.stamp" ] || [ python/requirements-torch.txt -nt "$envs/beside-torch/.stamp" ]; then
-        rm -rf "$envs/beside-torch"
+    local beside=$envs/beside-$name requirements=python/requirements-$name.txt
+    if [ ! -e "$beside/.stamp" ] || [ "$requirements" -nt "$beside/.stamp" ]; then
+        rm -rf "$beside"
         tools
-        "${pip[@]}" --python "$python" install --quiet --no-deps --target "$envs/beside-torch" \
-            --requirement python/requirements-torch.txt
-        touch "$envs/beside-torch/.stamp"
+        "${pip[@]}" --python "$python" install --quiet --no-deps --target "$beside" --requirement "$requirements"
+        touch "$beside/.stamp"
     fi
-    PYTHONPATH=$PWD/python/src:$envs/beside-torch box "$python" -m pytest --quiet -p no:cacheprovider \
-        python/tests/test_torch.py python/tests/test_policy.py
+    PYTHONPATH=$PWD/python/src:$beside box "$python" -m pytest --quiet -p no:cacheprovider "$@"
+}
+
+torch() { with_torch torch python/tests/test_torch.py python/tests/test_policy.py; }
+
+# One thread: other steps run beside it, and threads of OpenMP would spin.
+lab() {
+    if ! .venv-lerobot/bin/python -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then
+        echo "depthrig.lab needs Python 3.11 in .venv-lerobot"
+        return 77
+    fi
+    OMP_NUM_THREADS=1 with_torch lab tests/lab
 }
 
 oak() {
@@ -132,9 +144,9 @@ oak() {
 }
 
 case ${1:-} in
-environments | versions | torch | oak) "$1" ;;
+environments | versions | torch | lab | oak) "$1" ;;
 *)
-    sed -n '2,11s/^# \{0,1\}//p' "$0" >&2
+    sed -n '2,12s/^# \{0,1\}//p' "$0" >&2
     exit 2
     ;;
 esac

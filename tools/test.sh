@@ -113,6 +113,7 @@ beside() {
     # The wheel on other versions of Python, and with PyTorch.
     step python-versions tools/python.sh versions
     step python-torch optional "tests with PyTorch" tools/python.sh torch
+    step python-lab optional "the depth lab with PyTorch" tools/python.sh lab
 }
 # These wait more than they compute, so they run beside the tests in Rust; their output is printed when both have ended.
 set -m # in a process group of its own, which ends with this script
@@ -169,7 +170,7 @@ step vm optional "the virtual machine (tools/setup.sh vm)" \
     box -- tests/vm/run --no-build ${DEPTHRIG_REQUIRE_VM:+--require}
 
 # Every test that cargo and pytest counted, every check of the virtual machine, and one for each of the other steps.
-counted=(runner rust rust-quiet rust-doc rust-small rust-busy oak-crate python python-small python-versions python-torch python-oak daemon vm)
+counted=(runner rust rust-quiet rust-doc rust-small rust-busy oak-crate python python-small python-versions python-torch python-lab python-oak daemon vm)
 count() { # WORD
     local name
     for name in "${counted[@]}"; do cat "$logs/$name.log"; done | grep -oE "[0-9]+ $1" | awk '{n += $1} END {print n + 0}'

@@ -1,0 +1,139 @@
+"""Batches as a pure function of the seed and the step, so that a run that was killed goes on with the same ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch.utils.data import DataLoader, Dataset
+
+from .config import Config
+from .data import Source
+from .errors import LabError
+from .fill import fill
+from .sample import Sample
+from .synthesis import synthesise
+
+__all__ = ["Batches", "Example", "batch_of", "example", "loader", "raw_of", "seen_of"]
+
+Planes = dict[str, npt.NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Example:
+    """One crop: its name and its planes (`color`, `raw`, `truth`, `filled`, `seen`)."""
+
+    name: str
+    planes: Planes
+
+
+def seen_of(raw: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
+    """Return what the sensor can see: the rectangle around everything it measured.
+
+    Registration to colour leaves borders empty, and the field of some sensors is narrower than colour's.
+    """
+    seen = np.zeros(raw.shape, bool)
+    rows, columns = np.flatnonzero(raw.any(1)), np.flatnonzero(raw.any(0))
+    if rows.size:
+        seen[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = True
+    return seen
+
+
+def raw_of(sample: Sample, config: Config, rng: np.random.Generator) -> npt.NDArray[np.float32]:
+    """Return raw depth: the sample's, else made from its truth.
+
+    :raises LabError: when there is none and the configuration does not say how to make it.
+    """
+    if sample.raw is not None:
+        return sample.raw
+    if config.synthesis.sensor == "none":
+        raise LabError(f'{sample.name}: no raw depth; set sensor = "stereo" or "tof" under [synthesis]')
+    return synthesise(sample.need_truth(), config.synthesis, rng)
+
+
+def example(sample: Sample, config: Config, rng: np.random.Generator) -> Example:
+    """Return one random crop of a sample, its colours changed a little.
+
+    :raises LabError: when the image is smaller than the crop, or has no truth and the model needs it.
+    """
+    height, width = config.train.crop
+    if sample.color.shape[0] < height or sample.color.shape[1] < width:
+        found = f"{sample.color.shape[1]}x{sample.color.shape[0]}"
+        raise LabError(f"{sample.name}: {found} is smaller than the crop of {width}x{height}; choose a smaller crop")
+    needs_truth = config.model.kind in ("tiny", "cdm") or config.model.refined_input
+    truth = sample.need_truth() if needs_truth else sample.truth
+    raw = raw_of(sample, config, rng)
+    y = int(rng.integers(sample.color.shape[0] - height + 1))
+    x = int(rng.integers(sample.color.shape[1] - width + 1))
+    cut = (slice(y, y + height), slice(x, x + width))
+    jitter = config.train.color_jitter
+    color = sample.color[cut].astype(np.float32) / 255
+    gamma, gain = np.exp(jitter * rng.uniform(-1, 1)), np.exp(jitter * rng.uniform(-1, 1, 3) / 2)
+    color = np.clip(color**gamma * gain, 0, 1).astype(np.float32)
+    # Of the whole image: a crop has no borders of its own.
+    planes: Planes = {"color": color, "raw": raw[cut], "seen": seen_of(raw)[cut]}
+    planes["truth"] = np.zeros((height, width), np.float32) if truth is None else truth[cut]
+    if config.train.flip and rng.random() < 0.5:
+        planes = {name: plane[:, ::-1] for name, plane in planes.items()}
+    planes["color"] = planes["color"].transpose(2, 0, 1)
+    if config.model.kind == "tiny":
+        measured = planes["raw"] > 0
+        planes["filled"] = fill(np.where(measured, 1 / np.where(measured, planes["raw"], 1), 0))
+    return Example(sample.name, {name: np.ascontiguousarray(plane) for name, plane in planes.items()})
+
+
+def batch_of(examples: Sequence[Example]) -> dict[str, Any]:
+    """Return tensors of several examples, with their names."""
+    planes = {name: torch.from_numpy(np.stack([e.planes[name] for e in examples])) for name in examples[0].planes}
+    return {"names": [e.name for e in examples], **planes}
+
+
+class Batches(Dataset):  # type: ignore[type-arg,unused-ignore]
+    """The batch of each step. In each epoch every sample comes once (or `weight` times), in an order that is drawn."""
+
+    def __init__(self, sources: Sequence[Source], config: Config, rank: int = 0, world: int = 1):
+        self.sources = sources
+        self.config = config
+        self.rank = rank
+        self.world = world
+        self.counts = [max(1, round(len(s) * s.data.weight)) for s in sources]
+        self.ends = np.cumsum(self.counts)
+        self._order: tuple[int, npt.NDArray[np.int64]] = (-1, np.zeros(0, np.int64))
+
+    def _sample(self, position: int) -> Sample:
+        total = int(self.ends[-1])
+        epoch = position // total
+        if self._order[0] != epoch:
+            self._order = (epoch, np.random.default_rng([self.config.seed, 1, epoch]).permutation(total))
+        drawn = int(self._order[1][position % total])
+        at = int(np.searchsorted(self.ends, drawn, side="right"))
+        within = drawn - (int(self.ends[at]) - self.counts[at])
+        # With a weight that is not whole, other samples come in the next epoch.
+        return self.sources[at][(within + epoch * self.counts[at]) % len(self.sources[at])]
+
+    def __len__(self) -> int:
+        return self.config.train.steps
+
+    def __getitem__(self, step: int) -> dict[str, Any]:
+        size = self.config.train.batch
+        first = (step * self.world + self.rank) * size
+        examples = []
+        for position in range(first, first + size):
+            rng = np.random.default_rng([self.config.seed, 2, position])
+            examples.append(example(self._sample(position), self.config, rng))
+        return batch_of(examples)
+
+
+def loader(batches: Batches, first_step: int) -> Any:
+    """Return an iterable over the batches from a step on, read ahead by `workers` processes."""
+    workers = batches.config.train.workers
+    steps = range(first_step, batches.config.train.steps)
+    # A generator of its own, so that reading does not touch the one of the network.
+    own = torch.Generator().manual_seed(batches.config.seed)
+    # Not by fork: this process has threads.
+    options: dict[str, Any] = {"prefetch_factor": 2, "multiprocessing_context": "forkserver"} if workers else {}
+    return DataLoader(batches, batch_size=None, sampler=steps, num_workers=workers, generator=own, **options)

@@ -1,0 +1,74 @@
+"""Losses in PyTorch; all are means over pixels that count."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from .config import LossConfig
+
+__all__ = ["hole_loss", "refine_loss", "value_loss"]
+
+WRONG = 0.05
+"""Raw depth that is off by more than this share of the truth counts as missing."""
+
+
+def inverse(depth: Tensor) -> Tensor:
+    """Return 1/m of metres; 0 stays 0."""
+    return torch.where(depth > 0, 1 / depth.clamp_min(1e-6), 0.0)
+
+
+def refine_loss(predicted: Tensor, truth: Tensor, raw: Tensor, config: LossConfig) -> Tensor:
+    """Return the L1 and gradient loss of inverse depth.
+
+    The gradient loss is the mean difference between neighbours' differences, to the right and downwards, where both
+    have a truth within the range; it has one scale.
+
+    :param predicted: `(batch, height, width)`, 1/m.
+    :param truth: metres, 0 where unknown.
+    :param raw: metres, 0 for a hole.
+    """
+    valid = (truth >= config.near_m) & (truth <= config.far_m)
+    target = inverse(truth)
+    error = torch.where(valid, predicted - target, 0.0)
+    wrong = (raw - truth).abs() > WRONG * truth
+    weight = valid * torch.where(wrong, config.missing, 1.0)
+    loss = (weight * error.abs()).sum() / weight.sum().clamp_min(1e-6)
+    if config.gradient > 0:
+        right, down = valid[..., 1:] & valid[..., :-1], valid[:, 1:] & valid[:, :-1]
+        of_x = (error[..., 1:] - error[..., :-1]).abs() * right
+        of_y = (error[:, 1:] - error[:, :-1]).abs() * down
+        count = (right.sum() + down.sum()).clamp_min(1)
+        loss = loss + config.gradient * (of_x.sum() + of_y.sum()) / count
+    return loss
+
+
+def hole_loss(logits: Tensor, raw: Tensor, seen: Tensor) -> Tensor:
+    """Return the binary cross-entropy of "is a hole", over the pixels that the sensor can see.
+
+    :param seen: False at borders that registration to colour leaves empty, and outside the sensor's field.
+    """
+    each = F.binary_cross_entropy_with_logits(logits, (raw <= 0).to(logits.dtype), reduction="none")
+    return torch.where(seen, each, 0.0).sum() / seen.sum().clamp_min(1)
+
+
+def value_loss(predicted: Tensor, raw: Tensor, stereo: bool) -> Tensor:
+    """Return the L1 loss of relative depth, each brought to a median of 0 and a mean deviation of 1, where measured.
+
+    :param stereo: relative inverse depth; else depth.
+    """
+    losses = []
+    for one, measured in zip(predicted, raw, strict=True):
+        valid = measured > 0
+        if int(valid.sum()) < 2:
+            continue
+        target = (1 / measured[valid]) if stereo else measured[valid]
+        losses.append((_normalised(one[valid].float()) - _normalised(target)).abs().mean())
+    # An image without depth has no say, but a gradient.
+    return torch.stack(losses).mean() if losses else 0.0 * predicted.sum()
+
+
+def _normalised(values: Tensor) -> Tensor:
+    centred = values - values.median()
+    return centred / centred.abs().mean().clamp_min(1e-6)
