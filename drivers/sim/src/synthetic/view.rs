@@ -209,7 +209,7 @@ mod tests {
     fn nothing_between_two_balls_is_left_out() {
         let world = World::new();
         let all = world.all();
-        let lamp = Ball { center: super::super::scene::LAMP.0, radius: super::super::scene::LAMP.1 };
+        let lamp = world.lamps[0].ball();
         let mut met = 0;
         for i in 0..4000u32 {
             let r = super::super::noise::Rolls::new(5, i, 0, 0);
