@@ -99,7 +99,7 @@ impl<'a> Shader<'a> {
             world,
             view,
             seen: view.in_sight(world, tile),
-            shading: world.lamps.iter().map(|lamp| between(world, extent, lamp.ball())).collect(),
+            shading: world.lamps.iter().map(|lamp| between(world, extent, Ball::of(lamp))).collect(),
             near: between(world, reach, reach),
             all: world.all(),
             all_shading: vec![world.all(); world.lamps.len()],

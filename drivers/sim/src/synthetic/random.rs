@@ -53,7 +53,7 @@ pub(crate) struct RandomWorld {
     pub(crate) eye: DAffine3,
 }
 
-/// What random worlds are made of.
+/// The objects that random worlds have.
 #[derive(Debug)]
 pub(crate) struct Stock {
     /// Families to choose from; at least one.

@@ -3,7 +3,6 @@
 
 use super::shape::{Shape, Solid};
 use super::texture::{Look, Paint, Surface};
-use super::view::Ball;
 use glam::{Mat3, Quat, Vec3};
 
 /// Corners of the fixed world's room.
@@ -35,12 +34,6 @@ pub(crate) struct Thing {
     pub(crate) paint: Paint,
     /// Thin things and supports cast no contact shade worth its cost.
     pub(crate) is_thin: bool,
-}
-
-impl Lamp {
-    pub(crate) const fn ball(&self) -> Ball {
-        Ball { center: self.center, radius: self.radius }
-    }
 }
 
 impl Thing {
@@ -81,7 +74,7 @@ pub(crate) struct World {
     pub(crate) lamps: Vec<Lamp>,
     /// Corners of the room.
     pub(crate) room: (Vec3, Vec3),
-    /// Looks of floor, walls and ceiling; those of the fixed world when there are none.
+    /// Looks of floor, walls and ceiling; without them the fixed world's.
     pub(crate) room_looks: Option<[Look; 3]>,
     /// Light from all around: from below and from above.
     pub(crate) around: [Vec3; 2],

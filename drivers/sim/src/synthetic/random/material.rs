@@ -7,7 +7,7 @@ use glam::Vec3;
 /// Weights of the kinds of material, in the order diffuse, glossy, metal, glass, dark.
 pub(crate) type Weights = [f32; 5];
 
-/// What a thing of the household is made of.
+/// Materials of things of the household.
 pub(crate) const ANY: Weights = [0.42, 0.26, 0.10, 0.08, 0.14];
 pub(crate) const CARTON: Weights = [0.62, 0.22, 0.04, 0.02, 0.10];
 pub(crate) const CERAMIC: Weights = [0.20, 0.52, 0.08, 0.14, 0.06];

@@ -39,7 +39,7 @@ impl Superquadric {
     }
 
     /// Walks from outside towards the surface. Along a line the gauge is convex, so that Newton's steps from outside never
-    /// pass the crossing, and a slope that no longer falls says that there is none.
+    /// pass the crossing, and a slope that no longer falls says that the line misses.
     fn newton(&self, o: Vec3, d: Vec3, mut t: f32, way: f32) -> Option<f32> {
         let size = self.half.max_element() / d.length();
         for _ in 0..40 {

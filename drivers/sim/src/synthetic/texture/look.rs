@@ -24,7 +24,7 @@ pub(crate) enum Pattern {
     Speckle,
     /// Lines of a print on a ground.
     Print,
-    /// Tiles with joints.
+    /// Tiles with gaps.
     Tiles,
 }
 
@@ -89,10 +89,10 @@ impl Look {
             }
             Pattern::Print => print(q, n, layer, blur),
             Pattern::Tiles => {
-                let joint = |v: f32, flat: f32| {
+                let gap = |v: f32, flat: f32| {
                     if flat.abs() > 0.7 { 0.0 } else { ramp((v - v.floor() - 0.5).abs() - 0.485, blur) }
                 };
-                joint(q.x, n.x).max(joint(q.y, n.y)).max(joint(q.z, n.z))
+                gap(q.x, n.x).max(gap(q.y, n.y)).max(gap(q.z, n.z))
             }
         }
     }
