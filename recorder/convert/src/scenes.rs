@@ -5,6 +5,7 @@
 //! it was, and any part can be made on any computer with the same bytes.
 
 use core::sync::atomic::{AtomicU64, Ordering};
+use depthrig_bus::HostTime;
 use depthrig_bus::clock::process_cpu_ns;
 use depthrig_recorder::{Error, ErrorKind, Result};
 use depthrig_sim::synthetic::scenes::{Generator, Sensor, TriangleMesh};
@@ -98,7 +99,7 @@ pub fn write(
     depthrig_bus::umask::create_dir_all(&plan.folder)
         .map_err(|e| Error::io("create the folder", &plan.folder, e))?;
     record(generator, plan)?;
-    let start = std::time::Instant::now();
+    let start = HostTime::now();
     let cpu = process_cpu_ns();
     let mine: Vec<u64> = (0..plan.shards()).filter(|s| s % plan.part.1 == plan.part.0).collect();
     let is_missing = |s: &u64| !tar::is_whole(&plan.path(*s), plan.samples(*s));
@@ -296,7 +297,6 @@ impl Part {
         let options = OpenOptions::new().write(true).create(true).truncate(false).open(&path);
         let file = options.map_err(|e| Error::io("create", &path, e))?;
         match file.try_lock() {
-            Ok(()) => {}
             Err(TryLockError::WouldBlock) => {
                 let what = format!(
                     "{}: another process makes this shard; give each its own --shard",
@@ -305,7 +305,7 @@ impl Part {
                 return Err(Error::new(ErrorKind::InUse, what));
             }
             // Some network file systems have no locks.
-            Err(TryLockError::Error(_)) => {}
+            Err(TryLockError::Error(_)) | Ok(()) => {}
         }
         file.set_len(0).map_err(|e| Error::io("write", &path, e))?;
         Ok(Self { file, path })

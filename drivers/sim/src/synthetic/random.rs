@@ -204,7 +204,7 @@ impl Builder<'_> {
     fn set(&mut self, draw: &mut Draw, top: Top, count: usize, spread: f32) {
         let mut taken: Vec<(Vec3, f32)> = Vec::new();
         // Families come in groups: a table of bottles is as likely as one of everything.
-        let palette: Vec<Family> = (0..1 + draw.below(6)).map(|_| self.family(draw)).collect();
+        let palette: Vec<Family> = (0..=draw.below(6)).map(|_| self.family(draw)).collect();
         for _ in 0..count {
             let family = palette[draw.below(palette.len())];
             let large = if draw.chance(0.2) { draw.between(0.6, 1.7) } else { 1.0 };
@@ -257,7 +257,7 @@ impl Builder<'_> {
     fn furnish(&mut self, draw: &mut Draw) {
         let (low, high) = self.world.room;
         let floor = low.z;
-        for _ in 0..1 + draw.below(3) {
+        for _ in 0..=draw.below(3) {
             let half = [draw.between(0.35, 0.8), draw.between(0.3, 0.5)];
             let x = draw.between(low.x + 0.8, high.x - 0.8);
             let y = draw.between(low.y + 0.8, high.y - 0.8);
@@ -271,7 +271,7 @@ impl Builder<'_> {
             self.set(draw, top, count, 0.95);
         }
         // Cabinets and shelves along the walls.
-        for _ in 0..1 + draw.below(5) {
+        for _ in 0..=draw.below(5) {
             let half = Vec3::new(draw.between(0.2, 0.7), draw.between(0.15, 0.35), draw.between(0.2, 1.0));
             let side = draw.below(4);
             let along = draw.between(-0.85, 0.85);

@@ -82,7 +82,7 @@ pub(crate) fn patterned(draw: &mut Draw, surface: Surface, pattern: Pattern, siz
     };
     let texture = (busy * (0.35 + 1.8 * contrast) + 0.08 + draw.between(0.0, 0.6).powi(2)).min(1.0);
     // Dyes that absorb what is seen often send infrared back.
-    let mean = (luma(first) + luma(second)) / 2.0;
+    let mean = f32::midpoint(luma(first), luma(second));
     let albedo = (mean + draw.unit() * 0.5 * (0.75 - mean)).clamp(DARK_ALBEDO + 0.02, 0.9);
     let infrared = Infrared { albedo, texture };
     Look { surface, pattern, colors: [first, second], scale, layer: draw.below(1 << 20) as i32, infrared }

@@ -172,7 +172,7 @@ fn cup(draw: &mut Draw) -> Object {
     let height = draw.between(0.05, 0.13);
     let foot = draw.between(0.022, 0.04);
     let rim = foot * draw.between(1.0, 1.5);
-    let belly = (foot + rim) / 2.0 * draw.between(0.92, 1.2);
+    let belly = f32::midpoint(foot, rim) * draw.between(0.92, 1.2);
     let outside = curve(&[(foot, 0.0), (belly, height * 0.45), (rim, height)], 5);
     let look = paint(draw, material::CERAMIC, height);
     let mut made = Object { radius: belly.max(rim), height, ..Object::default() };

@@ -53,7 +53,7 @@ fn slow_mesh(solid: &Solid, o: DVec3, d: DVec3) -> Option<f64> {
     let turn = solid.axes.as_dmat3().transpose();
     let (o, d) = (turn * (o - solid.center.as_dvec3()), turn * d);
     let cross = |t: &[Vec3; 3]| {
-        let [a, b, c] = t.map(|p| p.as_dvec3());
+        let [a, b, c] = t.map(Vec3::as_dvec3);
         let n = (b - a).cross(c - a);
         let t = (a - o).dot(n) / d.dot(n);
         let p = o + d * t;
@@ -87,7 +87,7 @@ fn slow(world: &World, o: DVec3, d: DVec3) -> f64 {
             if inside(solid, o + d * t) {
                 let (mut out, mut within) = ((t - STEP_M / speed).max(0.0), t);
                 for _ in 0..40 {
-                    let half = (out + within) / 2.0;
+                    let half = f64::midpoint(out, within);
                     if inside(solid, o + d * half) { within = half } else { out = half }
                 }
                 best = best.min(within);

@@ -172,6 +172,9 @@ fn split(parts: &mut [([Vec3; 3], [Vec3; 3])], first: u32, nodes: &mut Vec<Node>
     nodes[at] = Node { low, high, at: second, count: 0 };
 }
 
+/// Edges belong to both triangles, with a margin for rounding: no ray passes between two of them.
+const MARGIN: f32 = -1e-5;
+
 /// Möller and Trumbore 1997.
 fn cross(triangle: &[Vec3; 3], o: Vec3, d: Vec3, number: u32) -> Option<Hit> {
     let [a, b, c] = *triangle;
@@ -185,8 +188,6 @@ fn cross(triangle: &[Vec3; 3], o: Vec3, d: Vec3, number: u32) -> Option<Hit> {
     let u = s.dot(p);
     let q = s.cross(ab);
     let v = d.dot(q);
-    // Edges belong to both triangles, with a margin for rounding: no ray passes between two of them.
-    const MARGIN: f32 = -1e-5;
     (u >= MARGIN && v >= MARGIN && u + v <= 1.0 - MARGIN).then(|| Hit {
         t: ac.dot(q),
         triangle: number,
