@@ -3,8 +3,8 @@
 use crate::args::Global;
 use crate::commands::{
     bench, calibrate, cameras, cat, cdm, cloud, compare, completions, config, demo, doctor, edit, eval,
-    export, import, info, install, man, merge, open, record, recover, replay, report, run, sessions, status,
-    stereo, tap, top, trim, verify, zed,
+    export, import, info, install, man, merge, open, record, recover, replay, report, run, scenes, sessions,
+    status, stereo, tap, top, trim, verify, zed,
 };
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
@@ -84,6 +84,9 @@ pub enum Command {
     /// Evaluate depth against a reference (metrics table, HTML report)
     #[command(after_help = eval::EXAMPLES)]
     Eval(eval::EvalArgs),
+    /// Make random scenes with true and measured depth, to train depth models with
+    #[command(after_help = scenes::EXAMPLES)]
+    Scenes(scenes::ScenesArgs),
     /// Export datasets to other layouts: ByteCameraDepth, LeRobot
     #[command(subcommand, after_help = export::EXAMPLES)]
     Export(export::ExportCommand),

@@ -25,6 +25,7 @@ pub mod recover;
 pub mod replay;
 pub mod report;
 pub mod run;
+pub mod scenes;
 pub mod sessions;
 pub mod status;
 pub mod stereo;
@@ -60,6 +61,7 @@ pub fn run(cli: Cli) -> Result<Exit> {
         Command::Sessions(args) => sessions::run(&args, &context),
         Command::Edit(args) => edit::run(&args, &context),
         Command::Eval(args) => eval::run(&args, &context),
+        Command::Scenes(args) => scenes::run(&args, &context),
         Command::Export(command) => export::run(&command, &context),
         Command::Import(command) => import::run(&command, &context),
         Command::Verify(args) => verify::run(&args, &context),

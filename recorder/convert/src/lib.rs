@@ -9,7 +9,7 @@
 //! An [`Importer`] reads one layout and is driven by [`import`], which records a dataset and verifies it.
 //!
 //! Layer 4. [`kinect`] reads recordings of an Azure Kinect; [`recalibrate`] plans another calibration of a dataset; [`relabel`](mod@relabel) and [`zed_replay`](mod@zed_replay) add
-//! depth to datasets.
+//! depth to datasets; [`scenes`] writes random scenes as training data.
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
 
 mod bytecamera;
@@ -24,6 +24,7 @@ pub mod recalibrate;
 pub mod relabel;
 mod report;
 mod rosbag;
+pub mod scenes;
 mod source;
 pub mod zed_replay;
 

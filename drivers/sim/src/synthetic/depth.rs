@@ -14,6 +14,8 @@ use rayon::prelude::*;
 mod stereo;
 mod tof;
 
+pub(crate) use stereo::SUBPIXEL;
+
 /// Input of a sensor's pixel, before noise.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Sample {
@@ -52,7 +54,12 @@ pub(crate) struct DepthPair {
 /// Renders both images.
 pub(crate) fn render(world: &World, view: &View<'_>, model: &Model, seed: u64) -> DepthPair {
     let mets = view.cast(world);
-    let samples = sample(world, view, &mets, model.depth);
+    DepthPair { sensed: sense(world, view, &mets, model, seed), truth: truth(&mets, model) }
+}
+
+/// The sensor's image alone, where the rays have been cast.
+pub(crate) fn sense(world: &World, view: &View<'_>, mets: &[Met], model: &Model, seed: u64) -> Vec<u16> {
+    let samples = sample(world, view, mets, model.depth);
     let unit = model.depth_unit_m;
     let sensed_m = match model.depth {
         DepthPrinciple::Stereo { .. } => stereo::measure(view, model, &samples, seed),
@@ -60,7 +67,7 @@ pub(crate) fn render(world: &World, view: &View<'_>, model: &Model, seed: u64) -
     };
     let (near, far) = model.range_m;
     let in_range = |z: &f32| if (near..=far).contains(z) { counts(*z, unit) } else { 0 };
-    DepthPair { sensed: sensed_m.iter().map(in_range).collect(), truth: truth(&mets, model) }
+    sensed_m.iter().map(in_range).collect()
 }
 
 /// The depth of the first surfaces, in counts of the model's depth unit.
@@ -69,7 +76,7 @@ pub(crate) fn truth(mets: &[Met], model: &Model) -> Vec<u16> {
 }
 
 /// Metres to counts; what a count cannot hold is 0, "no depth".
-fn counts(z_m: f32, unit_m: f64) -> u16 {
+pub(crate) fn counts(z_m: f32, unit_m: f64) -> u16 {
     let n = (f64::from(z_m) / unit_m).round();
     if n >= 1.0 && n <= f64::from(u16::MAX) { n as u16 } else { 0 }
 }

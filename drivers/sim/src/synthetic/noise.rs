@@ -81,6 +81,21 @@ pub(crate) fn smooth2(x: f32, y: f32, layer: i32) -> f32 {
     top * (1.0 - v) + bottom * v
 }
 
+/// Smooth noise in space, 0..1, features about 1 wide; `layer` picks another field.
+pub(crate) fn smooth3(p: glam::Vec3, layer: i32) -> f32 {
+    let floor = p.floor();
+    let [i, j, k] = [floor.x as i32, floor.y as i32, floor.z as i32];
+    let t = p - floor;
+    let ease = t * t * (glam::Vec3::splat(3.0) - 2.0 * t);
+    let at = |di: i32, dj: i32, dk: i32| {
+        let layer = layer.wrapping_add((k + dk).wrapping_mul(7919));
+        lattice(i + di, j + dj, layer)
+    };
+    let row = |dj: i32, dk: i32| at(0, dj, dk) * (1.0 - ease.x) + at(1, dj, dk) * ease.x;
+    let plane = |dk: i32| row(0, dk) * (1.0 - ease.y) + row(1, dk) * ease.y;
+    plane(0) * (1.0 - ease.z) + plane(1) * ease.z
+}
+
 /// Noise of three sizes, 0..1.
 pub(crate) fn fractal2(x: f32, y: f32, layer: i32) -> f32 {
     (smooth2(x, y, layer) * 4.0

@@ -1,24 +1,50 @@
-//! The world that all simulated cameras see: a room with a table and the things that give depth cameras
+//! The world that a camera sees, and the fixed one that all simulated cameras share: a room with a table and the things that give depth cameras
 //! trouble: thin, transparent, mirroring, dark, shiny and plain ones.
 
 use super::shape::{Shape, Solid};
-use super::texture::{Paint, Surface};
+use super::texture::{Look, Paint, Surface};
 use glam::{Mat3, Quat, Vec3};
 
-/// Corners of the room.
+/// Corners of the fixed world's room.
 const ROOM: (Vec3, Vec3) = (Vec3::new(-1.7, -1.9, -0.74), Vec3::new(1.7, 1.05, 1.75));
-/// Middle and radius of the lamp.
-pub(crate) const LAMP: (Vec3, f32) = (Vec3::new(-0.75, -0.55, 1.45), 0.11);
-/// The `what` of a point of the room itself; solids count from 0.
+/// The lamp of the fixed world.
+const LAMP: Lamp = Lamp {
+    center: Vec3::new(-0.75, -0.55, 1.45),
+    radius: 0.11,
+    power: 1.9,
+    color: Vec3::new(1.0, 0.93, 0.82),
+};
+/// The solid's number in the key of a point of the room itself; solids count from 0.
 const ROOM_KEY: u16 = 0xFFF;
 
+/// A lamp: a ball that shines.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Lamp {
+    pub(crate) center: Vec3,
+    pub(crate) radius: f32,
+    /// Light at 1 m.
+    pub(crate) power: f32,
+    pub(crate) color: Vec3,
+}
+
 /// A solid with its look.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub(crate) struct Thing {
     pub(crate) solid: Solid,
     pub(crate) paint: Paint,
     /// Thin things and supports cast no contact shade worth its cost.
     pub(crate) is_thin: bool,
+}
+
+impl Thing {
+    pub(crate) fn new(solid: Solid, paint: Paint) -> Self {
+        let is_thin = match &solid.shape {
+            Shape::Capsule { radius, .. } => *radius < 0.008,
+            Shape::Mesh(_) => true,
+            _ => paint.surface() == Surface::Glass,
+        };
+        Self { solid, paint, is_thin }
+    }
 }
 
 /// Where a ray ends: the distance, and what is there (solid number and face).
@@ -41,20 +67,38 @@ pub(crate) struct Spot {
     pub(crate) thing: u16,
 }
 
-/// The world.
+/// A world: the fixed one of the simulated cameras, or a random one.
 #[derive(Debug)]
 pub(crate) struct World {
     pub(crate) things: Vec<Thing>,
+    pub(crate) lamps: Vec<Lamp>,
+    /// Corners of the room.
+    pub(crate) room: (Vec3, Vec3),
+    /// Looks of floor, walls and ceiling; without them the fixed world's.
+    pub(crate) room_looks: Option<[Look; 3]>,
+    /// Light from all around: from below and from above.
+    pub(crate) around: [Vec3; 2],
+    pub(crate) exposure: f32,
+    /// Shadows take two rays where these agree, and one in what is reflected or seen through glass.
+    pub(crate) is_quick: bool,
 }
 
 impl World {
-    /// Builds the scene; it is always the same one.
+    /// Builds the fixed scene of the simulated cameras; it is always the same one.
     pub(crate) fn new() -> Self {
         let mut b = Builder { things: Vec::new() };
         b.furniture();
         b.table_setting();
         b.fork();
-        Self { things: b.things }
+        Self {
+            things: b.things,
+            lamps: vec![LAMP],
+            room: ROOM,
+            room_looks: None,
+            around: [Vec3::new(0.30, 0.245, 0.20), Vec3::new(0.43, 0.47, 0.53)],
+            exposure: 0.78,
+            is_quick: false,
+        }
     }
 
     /// Every solid, by number.
@@ -64,7 +108,7 @@ impl World {
 
     /// Where a ray out of the room's inside ends, looking only at the solids in `among`.
     pub(crate) fn meet(&self, among: &[u16], from: Vec3, dir: Vec3) -> Met {
-        let mut met = meet_room(from, dir);
+        let mut met = self.meet_room(from, dir);
         for i in among {
             if let Some(t) = self.things[usize::from(*i)].solid.meet(from, dir, 1e-4, met.t) {
                 met = Met { t, key: i << 3 };
@@ -73,8 +117,8 @@ impl World {
         met
     }
 
-    /// Whether a solid of `among` that is not clear stands between a spot and a point. The spot's own solid
-    /// is convex, so it can only do so by facing away.
+    /// Whether a solid of `among` that is not clear stands between a spot and a point. The spot's own solid, if it is
+    /// convex, can only do so by facing away.
     pub(crate) fn is_blocked(&self, among: &[u16], spot: &Spot, to: Vec3) -> bool {
         let from = spot.p + spot.n * 3e-4;
         let way = to - from;
@@ -83,7 +127,7 @@ impl World {
         }
         among.iter().any(|i| {
             let thing = &self.things[usize::from(*i)];
-            *i != spot.thing
+            (*i != spot.thing || thing.solid.is_hollow())
                 && thing.paint.surface() != Surface::Glass
                 && thing.solid.meet(from, way, 1e-4, 0.9999).is_some()
         })
@@ -95,29 +139,47 @@ impl World {
         let thing = met.key >> 3;
         if let Some(Thing { solid, paint, .. }) = self.things.get(usize::from(thing)) {
             let local = solid.to_local(p);
-            let normal_local = solid.normal_local(local).0;
+            let normal_local = solid.normal_met(from, dir, met.t);
             return Spot { p, n: solid.axes * normal_local, local, normal_local, paint: *paint, thing };
         }
         let n = room_normal(met.key);
-        let paint = match n.z {
-            z if z > 0.5 => Paint::Floor,
-            z if z < -0.5 => Paint::Ceiling,
-            _ => Paint::Wall,
-        };
+        let paint = self.room_paint(n);
         Spot { p, n, local: p, normal_local: n, paint, thing }
     }
 
+    /// The paint of what a key names.
+    pub(crate) fn paint(&self, key: u16) -> Paint {
+        match self.things.get(usize::from(key >> 3)) {
+            Some(thing) => thing.paint,
+            None => self.room_paint(room_normal(key)),
+        }
+    }
+
+    fn room_paint(&self, n: Vec3) -> Paint {
+        let (part, fixed) = match n.z {
+            z if z > 0.5 => (0, Paint::Floor),
+            z if z < -0.5 => (2, Paint::Ceiling),
+            _ => (1, Paint::Wall),
+        };
+        self.room_looks.map_or(fixed, |looks| Paint::Made(looks[part]))
+    }
+
     /// Distance of a point from the nearest surface, negative inside a solid.
-    #[cfg(test)]
     pub(crate) fn distance(&self, p: Vec3) -> f32 {
-        self.things.iter().map(|t| t.solid.distance(p)).fold(room_distance(p), f32::min)
+        self.things.iter().map(|t| t.solid.distance(p)).fold(self.room_distance(p), f32::min)
     }
 
     /// Adds the face to what was met, so that two faces of a block differ.
     pub(crate) fn with_face(&self, from: Vec3, dir: Vec3, met: Met) -> Met {
         match self.things.get(usize::from(met.key >> 3)) {
             Some(thing) => {
-                let face = thing.solid.normal_local(thing.solid.to_local(from + dir * met.t)).1;
+                let solid = &thing.solid;
+                let face = match solid.shape {
+                    Shape::Block { .. } | Shape::Cylinder { .. } => {
+                        solid.normal_local(solid.to_local(from + dir * met.t)).1
+                    }
+                    _ => 0,
+                };
                 Met { key: met.key | face, ..met }
             }
             None => met,
@@ -129,11 +191,14 @@ impl World {
         let mut open = 1.0;
         for (reach, weight) in [(0.02, 0.30), (0.08, 0.55)] {
             let at = spot.p + spot.n * reach;
-            let mut free = room_distance(at).min(reach);
+            let mut free = self.room_distance(at).min(reach);
             for i in among {
                 let thing = &self.things[usize::from(*i)];
                 // Over its own convex solid a spot is as free as it can be.
-                if *i != spot.thing && !thing.is_thin && thing.solid.is_within(at, reach) {
+                if (*i != spot.thing || thing.solid.is_hollow())
+                    && !thing.is_thin
+                    && thing.solid.is_within(at, reach)
+                {
                     free = free.min(thing.solid.distance(at));
                 }
             }
@@ -141,19 +206,23 @@ impl World {
         }
         open
     }
-}
 
-fn meet_room(from: Vec3, dir: Vec3) -> Met {
-    let (low, high) = ROOM;
-    let inverse = dir.recip();
-    let far = ((low - from) * inverse).max((high - from) * inverse);
-    // A direction along an axis makes the other quotients infinite or, on a wall, no number: never smallest.
-    let (axis, t) = [far.x, far.y, far.z]
-        .into_iter()
-        .enumerate()
-        .fold((2, f32::INFINITY), |best, (i, t)| if t < best.1 { (i, t) } else { best });
-    let side = u16::from(dir[axis] > 0.0);
-    Met { t: t.min(1e3), key: (ROOM_KEY << 3) | (axis as u16 * 2 + side) }
+    fn meet_room(&self, from: Vec3, dir: Vec3) -> Met {
+        let (low, high) = self.room;
+        let inverse = dir.recip();
+        let far = ((low - from) * inverse).max((high - from) * inverse);
+        // A direction along an axis makes the other quotients infinite or, on a wall, no number: never smallest.
+        let (axis, t) = [far.x, far.y, far.z]
+            .into_iter()
+            .enumerate()
+            .fold((2, f32::INFINITY), |best, (i, t)| if t < best.1 { (i, t) } else { best });
+        let side = u16::from(dir[axis] > 0.0);
+        Met { t: t.min(1e3), key: (ROOM_KEY << 3) | (axis as u16 * 2 + side) }
+    }
+
+    fn room_distance(&self, p: Vec3) -> f32 {
+        (p - self.room.0).min(self.room.1 - p).min_element()
+    }
 }
 
 fn room_normal(key: u16) -> Vec3 {
@@ -166,10 +235,6 @@ fn room_normal(key: u16) -> Vec3 {
     }
 }
 
-fn room_distance(p: Vec3) -> f32 {
-    (p - ROOM.0).min(ROOM.1 - p).min_element()
-}
-
 struct Builder {
     things: Vec<Thing>,
 }
@@ -180,12 +245,7 @@ fn turned(yaw_deg: f32) -> Mat3 {
 
 impl Builder {
     fn add(&mut self, shape: Shape, center: Vec3, axes: Mat3, paint: Paint) {
-        let solid = Solid::new(shape, center, axes);
-        let is_thin = match shape {
-            Shape::Capsule { radius, .. } => radius < 0.008,
-            _ => paint.surface() == Surface::Glass,
-        };
-        self.things.push(Thing { solid, paint, is_thin });
+        self.things.push(Thing::new(Solid::new(shape, center, axes), paint));
     }
 
     fn block(&mut self, half: [f32; 3], center: [f32; 3], yaw_deg: f32, paint: Paint) {
@@ -293,7 +353,7 @@ mod tests {
             assert!(met.t > 0.0 && met.t < 6.0);
             let spot = world.spot(from, dir, met);
             assert!(spot.n.dot(dir) <= 1e-3, "surfaces face the camera: {met:?}");
-            assert!(room_distance(spot.p) > -1e-4);
+            assert!(world.room_distance(spot.p) > -1e-4);
         }
         // Along the axes, where quotients are infinite.
         for dir in [Vec3::X, Vec3::Y, Vec3::NEG_Z] {

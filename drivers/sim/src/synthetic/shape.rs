@@ -1,9 +1,19 @@
-//! Solid shapes that a ray can meet: spheres, blocks, capsules and capped cylinders, each in its own frame.
+//! Solid shapes that a ray can meet: spheres, blocks, capsules, capped cylinders, superquadrics, solids of revolution and
+//! meshes, each in its own frame.
 
 use glam::{Mat3, Vec3};
+use std::sync::Arc;
+
+mod lathe;
+mod mesh;
+mod superquadric;
+
+pub(crate) use lathe::Lathe;
+pub(crate) use mesh::Mesh;
+pub(crate) use superquadric::Superquadric;
 
 /// A solid around the origin of its own frame.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Shape {
     Sphere {
         radius: f32,
@@ -21,10 +31,13 @@ pub(crate) enum Shape {
         half: f32,
         radius: f32,
     },
+    Superquadric(Superquadric),
+    Lathe(Arc<Lathe>),
+    Mesh(Arc<Mesh>),
 }
 
 /// A shape with its place in the world.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub(crate) struct Solid {
     pub(crate) shape: Shape,
     pub(crate) center: Vec3,
@@ -38,17 +51,20 @@ pub(crate) struct Solid {
 
 impl Solid {
     pub(crate) fn new(shape: Shape, center: Vec3, axes: Mat3) -> Self {
-        let bound = match shape {
-            Shape::Sphere { radius } => radius,
+        let bound = match &shape {
+            Shape::Sphere { radius } => *radius,
             Shape::Block { half } => half.length(),
             Shape::Capsule { half, radius } => half + radius,
-            Shape::Cylinder { half, radius } => half.hypot(radius),
+            Shape::Cylinder { half, radius } => half.hypot(*radius),
+            Shape::Superquadric(s) => s.half.length(),
+            Shape::Lathe(s) => s.bound(),
+            Shape::Mesh(s) => s.bound(),
         };
         Self { shape, center, axes, bound, bound_squared: bound * bound * 1.001 + 1e-8 }
     }
 
     /// The point of the world in the shape's own frame.
-    pub(crate) fn to_local(self, p: Vec3) -> Vec3 {
+    pub(crate) fn to_local(&self, p: Vec3) -> Vec3 {
         self.axes.transpose() * (p - self.center)
     }
 
@@ -66,11 +82,14 @@ impl Solid {
         }
         let o = self.axes.transpose() * -to;
         let d = self.axes.transpose() * dir;
-        match self.shape {
-            Shape::Sphere { radius } => first(sphere(o, d, radius)?, near, far),
-            Shape::Block { half } => first(slabs(o, d, half)?, near, far),
-            Shape::Cylinder { half, radius } => first(cylinder(o, d, half, radius)?, near, far),
-            Shape::Capsule { half, radius } => {
+        match &self.shape {
+            Shape::Sphere { radius } => first(sphere(o, d, *radius)?, near, far),
+            Shape::Block { half } => first(slabs(o, d, *half)?, near, far),
+            Shape::Cylinder { half, radius } => first(cylinder(o, d, *half, *radius)?, near, far),
+            Shape::Superquadric(s) => s.meet(o, d, near, far),
+            Shape::Lathe(s) => s.meet(o, d, near, far),
+            Shape::Mesh(s) => s.meet(o, d, near, far).map(|hit| hit.t),
+            &Shape::Capsule { half, radius } => {
                 // The union of three convex pieces: the first entry counts, and a ray from inside leaves last.
                 let pieces = [
                     cylinder(o, d, half, radius),
@@ -89,11 +108,11 @@ impl Solid {
 
     /// Outward normal at a point of the surface, in the shape's frame, and the number of the face.
     pub(crate) fn normal_local(&self, p: Vec3) -> (Vec3, u16) {
-        match self.shape {
+        match &self.shape {
             Shape::Sphere { .. } => (p.normalize_or(Vec3::Z), 0),
             Shape::Block { half } => {
                 // The face whose plane is nearest.
-                let off = (p.abs() - half).abs();
+                let off = (p.abs() - *half).abs();
                 if off.x < off.y && off.x < off.z {
                     (Vec3::X * p.x.signum(), u16::from(p.x > 0.0))
                 } else if off.y < off.z {
@@ -102,7 +121,9 @@ impl Solid {
                     (Vec3::Z * p.z.signum(), 4 + u16::from(p.z > 0.0))
                 }
             }
-            Shape::Capsule { half, .. } => ((p - Vec3::Z * p.z.clamp(-half, half)).normalize_or(Vec3::X), 0),
+            Shape::Capsule { half, .. } => {
+                ((p - Vec3::Z * p.z.clamp(-*half, *half)).normalize_or(Vec3::X), 0)
+            }
             Shape::Cylinder { half, radius } => {
                 let to_side = (p.x.hypot(p.y) - radius).abs();
                 if to_side < (p.z.abs() - half).abs() {
@@ -111,7 +132,27 @@ impl Solid {
                     (Vec3::Z * p.z.signum(), 1 + u16::from(p.z > 0.0))
                 }
             }
+            Shape::Superquadric(s) => (s.normal(p), 0),
+            Shape::Lathe(s) => (s.normal(p), 0),
+            // A point does not say which triangle it is on: `normal_met` does.
+            Shape::Mesh(_) => (Vec3::Z, 0),
         }
+    }
+
+    /// Normal in the shape's frame where a ray meets the solid at distance `t`: outward; of meshes towards the ray's side.
+    pub(crate) fn normal_met(&self, from: Vec3, dir: Vec3, t: f32) -> Vec3 {
+        let Shape::Mesh(mesh) = &self.shape else {
+            return self.normal_local(self.to_local(from + dir * t)).0;
+        };
+        let o = self.to_local(from);
+        let d = self.axes.transpose() * dir;
+        let margin = 1e-5 * t + 1e-7;
+        mesh.meet(o, d, t - margin, t + margin).map_or(-d.normalize_or(Vec3::Z), |hit| mesh.normal(hit, d))
+    }
+
+    /// Whether the solid can hide a spot of its own surface from a place that the spot faces.
+    pub(crate) const fn is_hollow(&self) -> bool {
+        matches!(self.shape, Shape::Lathe(_) | Shape::Mesh(_))
     }
 
     /// Whether the surface can be nearer than `reach` to a point of the world; a quick look that may say yes
@@ -123,18 +164,22 @@ impl Solid {
     /// Distance of a point of the world from the surface, negative inside.
     pub(crate) fn distance(&self, p: Vec3) -> f32 {
         let q = self.to_local(p);
-        match self.shape {
+        match &self.shape {
             Shape::Sphere { radius } => q.length() - radius,
             Shape::Block { half } => {
-                let e = q.abs() - half;
+                let e = q.abs() - *half;
                 e.max(Vec3::ZERO).length() + e.max_element().min(0.0)
             }
-            Shape::Capsule { half, radius } => (q - Vec3::Z * q.z.clamp(-half, half)).length() - radius,
+            Shape::Capsule { half, radius } => (q - Vec3::Z * q.z.clamp(-*half, *half)).length() - radius,
             Shape::Cylinder { half, radius } => {
                 let r = q.x.hypot(q.y) - radius;
                 let h = q.z.abs() - half;
                 r.max(0.0).hypot(h.max(0.0)) + r.max(h).min(0.0)
             }
+            Shape::Superquadric(s) => s.distance(q),
+            Shape::Lathe(s) => s.distance(q),
+            // Too far to matter to a contact shade; the sphere around it is what a camera keeps clear of.
+            Shape::Mesh(s) => q.length() - s.bound(),
         }
     }
 }
@@ -204,7 +249,26 @@ mod tests {
             (size.clone(), size.clone(), size.clone())
                 .prop_map(|(x, y, z)| Shape::Block { half: Vec3::new(x, y, z) }),
             (size.clone(), size.clone()).prop_map(|(half, radius)| Shape::Capsule { half, radius }),
-            (size.clone(), size).prop_map(|(half, radius)| Shape::Cylinder { half, radius }),
+            (size.clone(), size.clone()).prop_map(|(half, radius)| Shape::Cylinder { half, radius }),
+            (size.clone(), size.clone(), size.clone(), 0.25f32..2.0, 0.25f32..2.0).prop_map(
+                |(x, y, z, side, above)| {
+                    Shape::Superquadric(Superquadric { half: Vec3::new(x, y, z), side, above })
+                }
+            ),
+            // A cup: up the outside and down the inside.
+            (size.clone(), size.clone(), size, 0.02f32..0.04).prop_map(|(foot, rim, height, wall)| {
+                let bent = (foot + rim) * 0.55;
+                let outline = [
+                    (0.0, -height),
+                    (foot, -height),
+                    (bent, 0.0),
+                    (rim, height),
+                    (rim - wall, height),
+                    (bent - wall, 0.0),
+                    (0.0, wall - height),
+                ];
+                Shape::Lathe(Arc::new(Lathe::new(&outline)))
+            }),
         ]
     }
 
@@ -245,10 +309,13 @@ mod tests {
                     let p = from + dir * a;
                     prop_assert!(solid.distance(p).abs() < 1e-4);
                     prop_assert!((p - center).length() <= solid.bound + 1e-4);
-                    let n = solid.axes * solid.normal_local(solid.to_local(p)).0;
-                    prop_assert!(n.dot(dir) < 0.02, "the side that is seen faces the camera");
-                    // Half a millimetre outside along the normal is half a millimetre from the surface.
-                    prop_assert!((solid.distance(p + n * 5e-4) - 5e-4).abs() < 1e-4);
+                    // Smoothed normals and estimated distances are no measure.
+                    if !matches!(solid.shape, Shape::Lathe(_) | Shape::Superquadric(_)) {
+                        let n = solid.axes * solid.normal_local(solid.to_local(p)).0;
+                        prop_assert!(n.dot(dir) < 0.02, "the side that is seen faces the camera");
+                        // Half a millimetre outside along the normal is half a millimetre from the surface.
+                        prop_assert!((solid.distance(p + n * 5e-4) - 5e-4).abs() < 1e-4);
+                    }
                 }
                 (None, None) => {}
                 // A ray that grazes may be judged either way.

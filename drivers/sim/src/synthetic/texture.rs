@@ -3,6 +3,10 @@
 use super::noise::{fractal2, lattice, smooth2};
 use glam::Vec3;
 
+mod look;
+
+pub(crate) use look::{DARK_ALBEDO, Look, Pattern};
+
 /// How light leaves a surface.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Surface {
@@ -16,7 +20,7 @@ pub(crate) enum Surface {
 }
 
 /// The look of a thing.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Paint {
     Wood,
     DarkWood,
@@ -43,6 +47,8 @@ pub(crate) enum Paint {
     Steel,
     Eraser,
     Cutlery,
+    /// Of a random world.
+    Made(Look),
 }
 
 /// Infrared properties of a spot, for a depth camera.
@@ -57,6 +63,7 @@ pub(crate) struct Infrared {
 impl Paint {
     pub(crate) const fn surface(self) -> Surface {
         match self {
+            Self::Made(look) => look.surface,
             Self::Mirror => Surface::Mirror,
             Self::Glass => Surface::Glass,
             Self::Steel | Self::Cutlery => Surface::Shiny,
@@ -78,6 +85,7 @@ impl Paint {
     /// Its infrared properties, for a depth camera.
     pub(crate) const fn infrared(self) -> Infrared {
         let (albedo, texture) = match self {
+            Self::Made(look) => return look.infrared,
             Self::Wood => (0.55, 0.8),
             Self::DarkWood => (0.3, 0.5),
             Self::Wall | Self::Eraser => (0.7, 0.3),
@@ -106,6 +114,7 @@ impl Paint {
     /// Base colour (linear RGB) at a point in the thing's frame; `blur_m` is the width of a pixel there.
     pub(crate) fn color(self, p: Vec3, n: Vec3, blur_m: f32) -> Vec3 {
         match self {
+            Self::Made(look) => look.color(p, n, blur_m),
             Self::Wood => wood(p, blur_m),
             Self::DarkWood => {
                 Vec3::new(0.105, 0.055, 0.03) * (0.8 + 0.4 * smooth2(p.x * 30.0, p.z * 9.0 + p.y * 30.0, 3))

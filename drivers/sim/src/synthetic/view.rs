@@ -4,7 +4,7 @@
 //! meet; that can stand between it and the lamp) are found first by their bounding spheres; this is what makes
 //! ray casting affordable without a tree.
 
-use super::scene::{Met, World};
+use super::scene::{Lamp, Met, World};
 use depthrig_bus::Intrinsics;
 use depthrig_calib::Camera;
 use glam::{DAffine3, DVec2, Mat3, Vec3};
@@ -66,6 +66,13 @@ pub(crate) struct Tile {
 pub(crate) struct Ball {
     pub(crate) center: Vec3,
     pub(crate) radius: f32,
+}
+
+impl Ball {
+    /// The ball that a lamp is.
+    pub(crate) const fn of(lamp: &Lamp) -> Self {
+        Self { center: lamp.center, radius: lamp.radius }
+    }
 }
 
 impl<'a> View<'a> {
@@ -209,7 +216,7 @@ mod tests {
     fn nothing_between_two_balls_is_left_out() {
         let world = World::new();
         let all = world.all();
-        let lamp = Ball { center: super::super::scene::LAMP.0, radius: super::super::scene::LAMP.1 };
+        let lamp = Ball::of(&world.lamps[0]);
         let mut met = 0;
         for i in 0..4000u32 {
             let r = super::super::noise::Rolls::new(5, i, 0, 0);

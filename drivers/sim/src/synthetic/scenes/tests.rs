@@ -1,0 +1,104 @@
+use super::*;
+
+fn settings(cameras: &[&str]) -> Settings {
+    let cameras = cameras.iter().map(|c| (*c).to_owned()).collect();
+    Settings { seed: 5, width: 192, height: 144, cameras, ..Settings::default() }
+}
+
+#[test]
+fn a_sample_depends_on_seed_and_number_alone() {
+    let generator = Generator::new(settings(&["d435", "l515"])).unwrap();
+    let fifth = generator.sample(5).unwrap();
+    for n in [1, 3, 5] {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap();
+        let again = Generator::new(settings(&["d435", "l515"])).unwrap();
+        drop(again.sample(0).unwrap());
+        assert_eq!(pool.install(|| again.sample(5)).unwrap(), fifth, "{n} threads");
+    }
+    assert_eq!(fifth.camera, "l515");
+    assert_eq!(fifth.sensor_model, "tof");
+    let other = Generator::new(Settings { seed: 6, ..settings(&["d435", "l515"]) }).unwrap();
+    assert_ne!(other.sample(5).unwrap().truth, fifth.truth);
+    assert_ne!(generator.sample(7).unwrap().truth, fifth.truth);
+}
+
+/// Share of holes, and median error in metres of what was measured, by material.
+fn quality(samples: &[Triplet], material: u8) -> (f64, f64) {
+    let mut holes = 0;
+    let mut seen = 0;
+    let mut errors = Vec::new();
+    for s in samples {
+        for ((t, r), m) in s.truth.iter().zip(&s.raw).zip(&s.material) {
+            let z = f64::from(*t) * TRUTH_UNIT_M;
+            if *m != material || !(0.3..3.0).contains(&z) {
+                continue;
+            }
+            seen += 1;
+            if *r == 0 {
+                holes += 1;
+            } else {
+                errors.push((f64::from(*r) * s.raw_unit_m - z).abs() / z);
+            }
+        }
+    }
+    errors.sort_by(f64::total_cmp);
+    assert!(errors.len() > 100, "material {material}: {} of {seen} measured", errors.len());
+    (f64::from(holes) / f64::from(seen), errors[errors.len() / 2])
+}
+
+#[test]
+fn every_sensor_measures_most_of_what_is_diffuse_and_less_of_the_rest() {
+    for (camera, sensor) in [
+        ("d435", Sensor::Statistical),
+        ("l515", Sensor::Statistical),
+        ("zed2i", Sensor::Statistical),
+        ("d435", Sensor::Stereo),
+        ("d415", Sensor::Stereo),
+    ] {
+        // At the size at which the sensors work.
+        let wide = Settings { width: 640, height: 480, sensor, ..settings(&[camera]) };
+        let generator = Generator::new(wide).unwrap();
+        let samples: Vec<Triplet> = (0..10).map(|i| generator.sample(i).unwrap()).collect();
+        let (holes, error) = quality(&samples, 1);
+        let (dark_holes, dark_error) = quality(&samples, 5);
+        let (_, glass_error) = quality(&samples, 4);
+        let text = format!(
+            "{camera} {sensor:?}: {holes:.3} {error:.5} dark {dark_holes:.3} {dark_error:.5} glass {glass_error:.4}"
+        );
+        assert!(holes < 0.45 && error < 0.016, "{text}");
+        assert!(dark_holes > holes || dark_error > 1.3 * error, "{text}");
+        assert!(glass_error > error, "{text}");
+    }
+}
+
+#[test]
+fn truth_lies_in_the_view_of_colour() {
+    // Without faults, measured depth that is registered to colour is the truth: both come from other rays.
+    let generator =
+        Generator::new(Settings { width: 320, height: 240, ..settings(&["d435", "kinect", "l515"]) })
+            .unwrap();
+    for number in 0..6 {
+        let s = generator.sample(number).unwrap();
+        let near = s.truth.iter().zip(&s.raw).filter(|(t, r)| (1..30_000).contains(*t) && **r > 0);
+        let off: Vec<f64> =
+            near.map(|(t, r)| f64::from(*r) * s.raw_unit_m / (f64::from(*t) * TRUTH_UNIT_M) - 1.0).collect();
+        let good = off.iter().filter(|d| d.abs() < 0.05).count();
+        assert!(good * 10 > off.len() * 8, "{number}: {good} of {}", off.len());
+        assert_eq!(s.color.len(), 3 * 320 * 240);
+        let mean = s.color.iter().map(|v| f64::from(*v)).sum::<f64>() / s.color.len() as f64;
+        assert!((20.0..235.0).contains(&mean), "{number}: mean {mean}");
+        assert!(s.material.iter().all(|m| *m <= 5));
+    }
+}
+
+#[test]
+fn wrong_settings_are_refused() {
+    let refused = |s: Settings| Generator::new(s).unwrap_err().to_string();
+    assert!(refused(settings(&["d999"])).contains("d435"));
+    assert!(refused(settings(&[])).contains("no camera"));
+    assert!(refused(Settings { width: 8, ..settings(&["d435"]) }).contains("8x144"));
+    let meshes = Settings { families: vec![Family::Mesh], ..settings(&["d435"]) };
+    assert!(refused(meshes.clone()).contains("OBJ"));
+    let bad = TriangleMesh { corners: vec![[0.0; 3]; 3], triangles: vec![[0, 1, 3]] };
+    assert!(refused(Settings { meshes: vec![bad], ..meshes }).contains("damaged"));
+}

@@ -1,0 +1,362 @@
+//! Random scenes as shards of training data: tar files in the layout of `WebDataset`.
+//!
+//! [`write`] makes the shards of a part of a run. A shard has its name only when it is complete and durable, a complete shard
+//! is left alone, and sample `i` depends on the run's arguments and `i` alone: so a run that was killed goes on where
+//! it was, and any part can be made on any computer with the same bytes.
+
+use core::sync::atomic::{AtomicU64, Ordering};
+use depthrig_bus::HostTime;
+use depthrig_bus::clock::process_cpu_ns;
+use depthrig_recorder::{Error, ErrorKind, Result};
+use depthrig_sim::synthetic::scenes::{Generator, Sensor, TriangleMesh};
+use serde::Serialize;
+use std::fs::{File, OpenOptions, TryLockError};
+use std::io::{self, BufWriter};
+use std::path::{Path, PathBuf};
+
+mod sample;
+mod tar;
+
+pub use sample::contact_sheet;
+
+/// Version of the layout.
+pub const FORMAT: u32 = 1;
+/// Goes up when the generator makes other samples of the same arguments.
+const GENERATOR: u32 = 1;
+/// Samples that a thread makes between two writes.
+const BATCH: usize = 8;
+
+/// A part of a run.
+#[derive(Debug, Clone)]
+pub struct Plan {
+    /// Folder of the shards; made when missing.
+    pub folder: PathBuf,
+    /// First part of the shards' names.
+    pub name: String,
+    /// Samples of the whole run.
+    pub count: u64,
+    /// Samples of a shard.
+    pub per_shard: u64,
+    /// This part, from 0, and the number of parts: every `n`th shard.
+    pub part: (u64, u64),
+    /// Threads.
+    pub threads: usize,
+}
+
+/// Account of the work.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+pub struct Report {
+    /// Shards of this part, and those of them that were whole before.
+    pub shards: u64,
+    /// Whole before.
+    pub shards_found: u64,
+    /// Shards of this part that are missing at the end.
+    pub shards_missing: u64,
+    /// Samples made now.
+    pub samples: u64,
+    /// Bytes written now.
+    pub bytes: u64,
+    /// Time on the clock, seconds.
+    pub seconds: f64,
+    /// CPU time of the process, seconds.
+    pub cpu_seconds: f64,
+    /// Samples for each CPU second; 0 when none was made.
+    pub samples_per_core_second: f64,
+}
+
+impl Plan {
+    /// Shards of the whole run.
+    pub const fn shards(&self) -> u64 {
+        self.count.div_ceil(self.per_shard)
+    }
+
+    /// Path of a shard.
+    pub fn path(&self, shard: u64) -> PathBuf {
+        self.folder.join(format!("{}-{shard:06}.tar", self.name))
+    }
+
+    /// Numbers of the samples in a shard.
+    const fn samples(&self, shard: u64) -> core::ops::Range<u64> {
+        let first = shard * self.per_shard;
+        let end = first + self.per_shard;
+        first..if end < self.count { end } else { self.count }
+    }
+}
+
+/// Makes the shards of a part that are missing. `progress` gets the samples done and to do, and ends the work by returning
+/// false; the report then counts missing shards.
+///
+/// # Errors
+/// [`ErrorKind::BadInput`] for an impossible plan, and when the folder has a run of this name with other arguments;
+/// [`ErrorKind::InUse`] when another process makes the same shard; those of the file system. No half shard has a shard's
+/// name then.
+pub fn write(
+    generator: &Generator,
+    plan: &Plan,
+    progress: &mut dyn FnMut(u64, u64) -> bool,
+) -> Result<Report> {
+    check(plan)?;
+    depthrig_bus::umask::create_dir_all(&plan.folder)
+        .map_err(|e| Error::io("create the folder", &plan.folder, e))?;
+    record(generator, plan)?;
+    let start = HostTime::now();
+    let cpu = process_cpu_ns();
+    let mine: Vec<u64> = (0..plan.shards()).filter(|s| s % plan.part.1 == plan.part.0).collect();
+    let is_missing = |s: &u64| !tar::is_whole(&plan.path(*s), plan.samples(*s));
+    let missing: Vec<u64> = mine.iter().copied().filter(is_missing).collect();
+    let found = mine.len() - missing.len();
+    let mut report = Report { shards: mine.len() as u64, shards_found: found as u64, ..Report::default() };
+    let length = |s: &u64| plan.samples(*s).end - plan.samples(*s).start;
+    let total: u64 = mine.iter().map(length).sum();
+    let mut done = total - missing.iter().map(length).sum::<u64>();
+    let workers = workers(plan.threads)?;
+    report.shards_missing = missing.len() as u64;
+    let mut go_on = progress(done, total);
+    for shard in missing {
+        if !go_on {
+            break;
+        }
+        let made = one(generator, plan, shard, &workers, &mut |n| {
+            go_on = progress(done + n, total);
+            go_on
+        })?;
+        if let Some(bytes) = made {
+            done += length(&shard);
+            report.samples += length(&shard);
+            report.bytes += bytes;
+            report.shards_missing -= 1;
+        }
+    }
+    report.seconds = start.elapsed().as_secs_f64();
+    report.cpu_seconds = (process_cpu_ns() - cpu) as f64 * 1e-9;
+    if report.samples > 0 && report.cpu_seconds > 0.0 {
+        report.samples_per_core_second = report.samples as f64 / report.cpu_seconds;
+    }
+    Ok(report)
+}
+
+fn check(plan: &Plan) -> Result<()> {
+    let bad = |text: String| Err(Error::new(ErrorKind::BadInput, text));
+    let is_name = |c: char| c.is_ascii_alphanumeric() || "-_".contains(c);
+    if plan.name.is_empty() || plan.name.len() > 64 || !plan.name.chars().all(is_name) {
+        return bad(format!("invalid name \"{}\"; use up to 64 letters, digits, - and _", plan.name));
+    }
+    if plan.count == 0 || plan.count > 9_999_999_999 || plan.per_shard == 0 {
+        return bad(format!(
+            "invalid count {} or {} samples a shard; counts are 1 to 9999999999",
+            plan.count, plan.per_shard
+        ));
+    }
+    if plan.shards() > 1_000_000 {
+        return bad(format!("{} shards are too many; put more samples into each", plan.shards()));
+    }
+    if plan.part.0 >= plan.part.1 {
+        return bad(format!("invalid part {}/{}; parts are 0/n to n-1/n", plan.part.0, plan.part.1));
+    }
+    Ok(())
+}
+
+/// The arguments of a run: `NAME.json`, the same bytes from every part.
+#[derive(Serialize)]
+struct Record<'a> {
+    format: u32,
+    generator: String,
+    arguments: Arguments<'a>,
+    samples: u64,
+    shards: u64,
+}
+
+#[derive(Serialize)]
+struct Arguments<'a> {
+    seed: u64,
+    count: u64,
+    per_shard: u64,
+    cameras: &'a [String],
+    sensor: &'static str,
+    families: Vec<&'static str>,
+    width: u32,
+    height: u32,
+    meshes: usize,
+    /// Checksum of the meshes.
+    meshes_crc32: u32,
+}
+
+fn checksum(meshes: &[TriangleMesh]) -> u32 {
+    let mut sum = crc32fast::Hasher::new();
+    for mesh in meshes {
+        for number in mesh.corners.iter().flatten() {
+            sum.update(&number.to_le_bytes());
+        }
+        for number in mesh.triangles.iter().flatten() {
+            sum.update(&number.to_le_bytes());
+        }
+    }
+    sum.finalize()
+}
+
+/// Writes `NAME.json`, or checks that the one that is there agrees.
+fn record(generator: &Generator, plan: &Plan) -> Result<()> {
+    let s = generator.settings();
+    let record = Record {
+        format: FORMAT,
+        generator: format!("depthrig {} scenes {GENERATOR}", env!("CARGO_PKG_VERSION")),
+        arguments: Arguments {
+            seed: s.seed,
+            count: plan.count,
+            per_shard: plan.per_shard,
+            cameras: &s.cameras,
+            sensor: match s.sensor {
+                Sensor::Statistical => "statistical",
+                Sensor::Stereo => "stereo",
+            },
+            families: s.families.iter().map(|f| f.name()).collect(),
+            width: s.width,
+            height: s.height,
+            meshes: s.meshes.len(),
+            meshes_crc32: checksum(&s.meshes),
+        },
+        samples: plan.count,
+        shards: plan.shards(),
+    };
+    let path = plan.folder.join(format!("{}.json", plan.name));
+    let mut text = serde_json::to_string_pretty(&record)
+        .map_err(|e| Error::new(ErrorKind::BadInput, format!("{}: {e}", path.display())))?;
+    text.push('\n');
+    match depthrig_bus::files::read_to_string(&path, depthrig_bus::files::TEXT_MAX_BYTES) {
+        Ok(there) if there == text => Ok(()),
+        Ok(_) => Err(Error::new(
+            ErrorKind::BadInput,
+            format!(
+                "{} is of a run with other arguments or another version; give this run another folder or --name",
+                path.display()
+            ),
+        )),
+        Err(e) if e.kind() == io::ErrorKind::NotFound => {
+            depthrig_bus::files::replace(&path, text.as_bytes()).map_err(|e| Error::io("write", &path, e))
+        }
+        Err(e) => Err(Error::reading("read", &path, e)),
+    }
+}
+
+/// Pools of one thread each: a sample is made on one thread, and several at once.
+fn workers(threads: usize) -> Result<Vec<rayon::ThreadPool>> {
+    let pool = |i| {
+        rayon::ThreadPoolBuilder::new()
+            .num_threads(1)
+            .thread_name(move |_| format!("scenes-{i}"))
+            .build()
+            .map_err(|e| Error::new(ErrorKind::Io, format!("a thread cannot be started: {e}")))
+    };
+    (0..threads.max(1)).map(pool).collect()
+}
+
+/// Makes one shard; its bytes, or nothing when the work was ended.
+fn one(
+    generator: &Generator,
+    plan: &Plan,
+    shard: u64,
+    workers: &[rayon::ThreadPool],
+    progress: &mut dyn FnMut(u64) -> bool,
+) -> Result<Option<u64>> {
+    let path = plan.path(shard);
+    let part = Part::create(&path)?;
+    let mut out = tar::Tar::new(BufWriter::with_capacity(1 << 20, &part.file));
+    let wrote = |e: io::Error| Error::io("write", &path, e);
+    let all = plan.samples(shard);
+    let first = all.start;
+    let mut next = first;
+    while next < all.end {
+        let batch = next..all.end.min(next + (workers.len() * BATCH) as u64);
+        next = batch.end;
+        for members in make(generator, batch, workers)? {
+            for (name, bytes) in members {
+                out.append(&name, &bytes).map_err(wrote)?;
+            }
+        }
+        if !progress(next - first) {
+            return Ok(None);
+        }
+    }
+    let bytes = out.finish().map_err(wrote)?;
+    part.rename(&path).map_err(wrote)?;
+    Ok(Some(bytes))
+}
+
+/// A shard that is being written. Dropped before it got its name, it is removed.
+struct Part {
+    file: File,
+    path: PathBuf,
+}
+
+impl Part {
+    fn create(shard: &Path) -> Result<Self> {
+        let mut name = shard.as_os_str().to_owned();
+        name.push(".part");
+        let path = PathBuf::from(name);
+        // One that a killed run left is written anew.
+        let options = OpenOptions::new().write(true).create(true).truncate(false).open(&path);
+        let file = options.map_err(|e| Error::io("create", &path, e))?;
+        match file.try_lock() {
+            Err(TryLockError::WouldBlock) => {
+                let what = format!(
+                    "{}: another process makes this shard; give each its own --shard",
+                    path.display()
+                );
+                return Err(Error::new(ErrorKind::InUse, what));
+            }
+            // Some network file systems have no locks.
+            Err(TryLockError::Error(_)) | Ok(()) => {}
+        }
+        file.set_len(0).map_err(|e| Error::io("write", &path, e))?;
+        Ok(Self { file, path })
+    }
+
+    fn rename(self, to: &Path) -> io::Result<()> {
+        self.file.sync_all()?;
+        std::fs::rename(&self.path, to)?;
+        depthrig_bus::files::sync_folder_of(to)
+    }
+}
+
+impl Drop for Part {
+    fn drop(&mut self) {
+        drop(std::fs::remove_file(&self.path)); // gone already when it was renamed
+    }
+}
+
+/// The members of each sample of a batch, in order.
+fn make(
+    generator: &Generator,
+    batch: core::ops::Range<u64>,
+    workers: &[rayon::ThreadPool],
+) -> Result<Vec<sample::Members>> {
+    let next = AtomicU64::new(batch.start);
+    let work = || {
+        let mut made = Vec::new();
+        loop {
+            let number = next.fetch_add(1, Ordering::Relaxed);
+            if number >= batch.end {
+                return Ok::<_, Error>(made);
+            }
+            let wrong = |e: depthrig_driver::Error| {
+                Error::new(ErrorKind::BadInput, format!("sample {number}: {e}")).with_source(e)
+            };
+            let triplet = generator.sample(number).map_err(wrong)?;
+            made.push((number, sample::members(&triplet, generator.settings())?));
+        }
+    };
+    let results: Vec<Result<_>> = std::thread::scope(|scope| {
+        let threads: Vec<_> = workers.iter().map(|w| scope.spawn(|| w.install(work))).collect();
+        let crashed = || Err(Error::new(ErrorKind::Io, "a thread that makes samples crashed"));
+        threads.into_iter().map(|t| t.join().unwrap_or_else(|_| crashed())).collect()
+    });
+    let mut all = Vec::new();
+    for result in results {
+        all.extend(result?);
+    }
+    all.sort_unstable_by_key(|(number, _)| *number);
+    Ok(all.into_iter().map(|(_, members)| members).collect())
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,178 @@
+use super::*;
+use depthrig_sim::synthetic::scenes::{Settings, TRUTH_UNIT_M};
+use std::collections::BTreeMap;
+
+fn generator() -> Generator {
+    Generator::new(Settings { seed: 3, width: 64, height: 48, ..Settings::default() }).unwrap()
+}
+
+fn plan(folder: &Path) -> Plan {
+    Plan { folder: folder.to_owned(), name: "t".into(), count: 7, per_shard: 3, part: (0, 1), threads: 2 }
+}
+
+fn go(plan: &Plan) -> Report {
+    write(&generator(), plan, &mut |_, _| true).unwrap()
+}
+
+/// Names and contents of every file of a folder.
+fn files(folder: &Path) -> BTreeMap<String, Vec<u8>> {
+    let entries = std::fs::read_dir(folder).unwrap().map(|e| e.unwrap());
+    entries.map(|e| (e.file_name().into_string().unwrap(), std::fs::read(e.path()).unwrap())).collect()
+}
+
+/// Members of a tar file, as the program `tar` of this computer lists and extracts them.
+fn untar(path: &Path) -> Vec<(String, Vec<u8>)> {
+    let tar = |args: &[&str]| {
+        let out = std::process::Command::new("tar").args(args).arg("-f").arg(path).output().unwrap();
+        assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+        out.stdout
+    };
+    let names = String::from_utf8(tar(&["-t"])).unwrap();
+    names
+        .lines()
+        .map(|n| {
+            let out = std::process::Command::new("tar").args(["-xOf"]).arg(path).arg(n).output().unwrap();
+            (n.to_owned(), out.stdout)
+        })
+        .collect()
+}
+
+#[test]
+fn a_shard_holds_its_samples_as_the_format_says() {
+    let dir = tempfile::tempdir().unwrap();
+    let report = go(&plan(dir.path()));
+    assert_eq!((report.shards, report.shards_found, report.shards_missing, report.samples), (3, 0, 0, 7));
+    let names: Vec<String> = files(dir.path()).into_keys().collect();
+    assert_eq!(names, ["t-000000.tar", "t-000001.tar", "t-000002.tar", "t.json"]);
+    let members = untar(&dir.path().join("t-000001.tar"));
+    assert_eq!(members.len(), 15);
+    for (i, (name, content)) in members.iter().enumerate() {
+        let kind = ["color.png", "truth.png", "raw.png", "material.png", "json"][i % 5];
+        let number = 3 + i as u64 / 5;
+        assert_eq!(*name, format!("{number:010}.{kind}"));
+        let made = generator().sample(number).unwrap();
+        if kind == "json" {
+            let v: serde_json::Value = serde_json::from_slice(content).unwrap();
+            assert_eq!(v["truth_unit_m"], TRUTH_UNIT_M);
+            assert_eq!(v["sensor"], "d435");
+            assert_eq!(v["intrinsics"]["fx"], made.intrinsics.fx);
+            assert_eq!(v["intrinsics"]["model"], "none");
+            let keys: Vec<&str> = v.as_object().unwrap().keys().map(String::as_str).collect();
+            let mut known = [
+                "format",
+                "sensor",
+                "sensor_model",
+                "seed",
+                "families",
+                "scene",
+                "intrinsics",
+                "truth_unit_m",
+                "raw_unit_m",
+                "width",
+                "height",
+                "licence",
+            ];
+            known.sort_unstable();
+            let mut keys = keys;
+            keys.sort_unstable();
+            assert_eq!(keys, known);
+            continue;
+        }
+        let image = image::load_from_memory(content).unwrap();
+        assert_eq!((image.width(), image.height()), (64, 48));
+        match kind {
+            "color.png" => assert_eq!(image.as_rgb8().unwrap().as_raw(), &made.color),
+            "truth.png" => assert_eq!(image.as_luma16().unwrap().as_raw(), &made.truth),
+            "raw.png" => assert_eq!(image.as_luma16().unwrap().as_raw(), &made.raw),
+            _ => assert_eq!(image.as_luma8().unwrap().as_raw(), &made.material),
+        }
+    }
+}
+
+#[test]
+fn parts_made_anywhere_are_the_bytes_of_the_run() {
+    let one = tempfile::tempdir().unwrap();
+    let two = tempfile::tempdir().unwrap();
+    go(&plan(one.path()));
+    for k in [1, 0] {
+        go(&Plan { part: (k, 2), threads: 1, ..plan(two.path()) });
+    }
+    assert_eq!(files(one.path()), files(two.path()));
+}
+
+#[test]
+fn an_interrupted_run_goes_on_and_ends_with_the_same_bytes() {
+    let whole = tempfile::tempdir().unwrap();
+    go(&plan(whole.path()));
+    let dir = tempfile::tempdir().unwrap();
+    // Ended within the second shard.
+    let report = write(&generator(), &plan(dir.path()), &mut |done, _| done < 6).unwrap();
+    assert_eq!((report.shards, report.shards_missing), (3, 2));
+    let names: Vec<String> = files(dir.path()).into_keys().collect();
+    assert_eq!(names, ["t-000000.tar", "t.json"], "no half shard is left");
+    // What a kill leaves behind, and a shard that a copy cut.
+    std::fs::write(dir.path().join("t-000001.tar.part"), b"half").unwrap();
+    let cut = dir.path().join("t-000000.tar");
+    let bytes = std::fs::read(&cut).unwrap();
+    std::fs::write(&cut, &bytes[..bytes.len() - 512]).unwrap();
+    let report = go(&plan(dir.path()));
+    assert_eq!((report.shards_found, report.samples), (0, 7));
+    assert_eq!(files(dir.path()), files(whole.path()));
+    let report = go(&plan(dir.path()));
+    assert_eq!((report.shards_found, report.samples, report.bytes), (3, 0, 0));
+}
+
+#[test]
+fn a_damaged_shard_is_not_whole() {
+    let dir = tempfile::tempdir().unwrap();
+    let p = plan(dir.path());
+    go(&p);
+    let path = p.path(0);
+    assert!(tar::is_whole(&path, 0..3) && !tar::is_whole(&path, 0..4) && !tar::is_whole(&path, 1..3));
+    let good = std::fs::read(&path).unwrap();
+    for keep in [0, 511, 1024, good.len() - 1024, good.len() - 1] {
+        std::fs::write(&path, &good[..keep]).unwrap();
+        assert!(!tar::is_whole(&path, 0..3), "{keep} bytes of {}", good.len());
+    }
+    std::fs::write(&path, [good.as_slice(), &[0]].concat()).unwrap();
+    assert!(!tar::is_whole(&path, 0..3), "something follows");
+}
+
+#[test]
+fn another_run_another_process_and_impossible_plans_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    go(&plan(dir.path()));
+    let refused = |plan: &Plan| write(&generator(), plan, &mut |_, _| true).unwrap_err();
+    let e = refused(&Plan { count: 8, ..plan(dir.path()) });
+    assert!(e.to_string().contains("t.json") && e.to_string().contains("--name"), "{e}");
+    std::fs::remove_file(plan(dir.path()).path(1)).unwrap();
+    let part = File::create(dir.path().join("t-000001.tar.part")).unwrap();
+    part.lock().unwrap();
+    let e = refused(&plan(dir.path()));
+    assert_eq!(e.kind(), ErrorKind::InUse, "{e}");
+    for bad in [
+        Plan { name: "../t".into(), ..plan(dir.path()) },
+        Plan { per_shard: 0, ..plan(dir.path()) },
+        Plan { part: (2, 2), ..plan(dir.path()) },
+    ] {
+        assert_eq!(refused(&bad).kind(), ErrorKind::BadInput);
+    }
+}
+
+#[test]
+fn a_full_disk_is_an_error_and_leaves_no_shard() {
+    let e = Tar::full();
+    assert_eq!(e.kind(), ErrorKind::DiskFull, "{e}");
+    assert!(e.to_string().contains("the disk is full"), "{e}");
+}
+
+struct Tar;
+
+impl Tar {
+    /// The error of writing a member to a disk that is full.
+    fn full() -> Error {
+        let full = OpenOptions::new().write(true).open("/dev/full").unwrap();
+        let mut out = tar::Tar::new(full);
+        Error::io("write", Path::new("x.tar"), out.append("a", &[1; 4096]).unwrap_err())
+    }
+}
