@@ -37,9 +37,7 @@ RIG = 'rig = "cost"\n[control]\ntcp = "127.0.0.1:0"\n[sets]\nrate_hz = 5.0\n[rec
     )
     for i in range(CAMERAS)
 )
-WATCH = [
-    {"stream": f"c{i}/{s}", "width": 640, "rate_hz": 10} for i in range(CAMERAS) for s in ("color", "depth")
-]
+WATCH = [{"stream": f"c{i}/{s}", "width": 640, "rate_hz": 10} for i in range(CAMERAS) for s in ("color", "depth")]
 HEAD = struct.Struct("<HBBHHHHHHQqqfI")
 TICKS = os.sysconf("SC_CLK_TCK")
 THREADS = ("viewers", "api")
@@ -75,7 +73,9 @@ def work(share: float, stop: multiprocessing.synchronize.Event) -> None:
 
 
 @contextmanager
-def beside(target: Callable[..., None], arguments: list[tuple], stop: multiprocessing.synchronize.Event) -> Iterator[None]:
+def beside(
+    target: Callable[..., None], arguments: list[tuple], stop: multiprocessing.synchronize.Event
+) -> Iterator[None]:
     processes = [multiprocessing.Process(target=target, args=a) for a in arguments]
     for process in processes:
         process.start()

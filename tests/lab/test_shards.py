@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import os
+import subprocess
 import sys
 import tarfile
 from pathlib import Path
@@ -173,3 +175,23 @@ def test_a_part_is_k_of_n() -> None:
 def test_depth_beyond_16_bits_is_none() -> None:
     units = shards.to_units(np.array([[0, 1e-5, 1e-4, 6.5535, 6.5536, 1e9]], np.float32), 1e-4)
     assert units.tolist() == [[0, 0, 1, 65535, 0, 0]]
+
+
+@pytest.mark.skipif("DEPTHRIG_BIN" not in os.environ, reason="DEPTHRIG_BIN is not set")
+def test_shards_of_the_generator_are_read(tmp_path: Path) -> None:
+    command = [os.environ["DEPTHRIG_BIN"], "scenes", "--count", "4", "--camera", "d435,l515", "--out", str(tmp_path)]
+    subprocess.run(command, check=True, capture_output=True, timeout=300)
+    (shard,) = [shards.Shard(path) for path in shards.list_shards(tmp_path)]
+    assert len(shard) == 4
+    for got in (shard[i] for i in range(4)):
+        assert got.raw is not None
+        assert got.truth is not None
+        assert got.material is not None
+        assert got.color.shape == (*got.truth.shape, 3)
+        assert got.raw.shape == got.truth.shape
+        assert got.intrinsics is not None
+        assert got.licence.ships
+        both = (got.raw > 0) & (got.truth > 0)
+        assert both.mean() > 0.3
+        # In the same unit, and of the same pixels.
+        assert np.median(np.abs(got.raw - got.truth)[both] / got.truth[both]) < 0.02

@@ -9,7 +9,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from page import CHROMIUM, FAR, HOLE, MIDDLE, NEAR, RIG, Address, address, blank, files_camera, free_port, opened, pattern, until
+from page import (
+    CHROMIUM,
+    FAR,
+    HOLE,
+    MIDDLE,
+    NEAR,
+    RIG,
+    Address,
+    address,
+    blank,
+    files_camera,
+    free_port,
+    opened,
+    pattern,
+    until,
+)
 from playwright.sync_api import Browser, Route, WebSocketRoute
 from test_daemon import WAIT_S, binary, running, runtime
 from test_page import CODES, browser, millimetres, near
