@@ -60,6 +60,7 @@ fn every_command_has_help_that_fits_and_an_entry_in_the_manual() {
         "zed",
         "cdm",
         "eval",
+        "scenes",
         "recover",
         "bench",
         "completions",
