@@ -131,7 +131,7 @@ export class Reference {
     const tile = this.#tile;
     const bitmap = tile?.shown?.bitmap;
     if (tile === null || !bitmap) {
-      setText(this.#shiftLine, "There is no image to keep yet");
+      setText(this.#shiftLine, "No image to keep has come yet");
       return;
     }
     const { columns: fullColumns, rows: fullRows } = tile.fullSize;

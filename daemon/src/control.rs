@@ -45,7 +45,7 @@ pub trait Control: Send + Sync {
     fn doctor(&self) -> Result<Examined> {
         Err(Error::new(ErrorKind::WrongState, "this rig replays datasets and has no cameras to examine"))
     }
-    /// How uncertain the calibration in use is over the images of each calibrated camera; none of a replay.
+    /// Uncertainty of the calibration in use over the images of each calibrated camera; none of a replay.
     fn calibration(&self) -> Vec<CalibratedImage> {
         Vec::new()
     }
@@ -139,11 +139,11 @@ pub struct CalibratedImage {
     pub width: u32,
     /// Rows.
     pub height: u32,
-    /// How uncertain projection is over the image; `None` where the calibration's file does not have it.
+    /// Uncertainty of projection over the image; `None` where the calibration's file does not have it.
     pub uncertainty: Option<UncertaintyOfImage>,
 }
 
-/// How uncertain projection is over an image, as the calibration's report shows it.
+/// Uncertainty of projection over an image, as the calibration's report shows it.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct UncertaintyOfImage {
     /// Distance of the points that are projected, metres.

@@ -84,7 +84,7 @@ impl Losses {
 /// The history of the losses of one recording.
 #[derive(Debug, Default)]
 pub struct LossHistory {
-    /// How often the width was doubled.
+    /// Doublings of the width.
     doublings: u32,
     /// By number of the bucket.
     buckets: BTreeMap<u64, Losses>,

@@ -10,9 +10,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 
-/// How often the supervisors look at their cameras.
+/// Pause between two looks of the supervisors at their cameras.
 const STEP: Duration = Duration::from_millis(20);
-/// How long one camera thread gets to end; with it the whole stop stays below a second.
+/// Time for one camera thread to end; with it the whole stop stays below a second.
 const STOP_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// Starts a thread that ends when its flag is set.

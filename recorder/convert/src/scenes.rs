@@ -46,9 +46,9 @@ pub struct Plan {
 /// Account of the work.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct Report {
-    /// Shards of this part, and those of them that were whole before.
+    /// Shards of this part.
     pub shards: u64,
-    /// Whole before.
+    /// Shards of this part that were whole before.
     pub shards_found: u64,
     /// Shards of this part that are missing at the end.
     pub shards_missing: u64,

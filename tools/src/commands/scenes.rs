@@ -209,7 +209,7 @@ fn mesh(path: &Path) -> Result<TriangleMesh> {
         Err::<&[u8], _>(std::io::Error::other("materials are not used"))
     })
     .map_err(wrong)?;
-    let mut all = TriangleMesh::default();
+    let mut all = TriangleMesh { name: path.display().to_string(), ..TriangleMesh::default() };
     for mesh in &scene.meshes {
         let first = all.corners.len() as u32;
         all.corners.extend(&mesh.vertices);

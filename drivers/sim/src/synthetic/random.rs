@@ -50,7 +50,7 @@ pub(crate) struct RandomWorld {
     /// Families of the objects in it, each once, in order.
     pub(crate) families: Vec<Family>,
     /// The depth camera in the world.
-    pub(crate) eye: DAffine3,
+    pub(crate) camera_pose: DAffine3,
 }
 
 /// The objects that random worlds have.
@@ -76,22 +76,22 @@ impl RandomWorld {
         builder.families.sort_unstable();
         builder.families.dedup();
         let Builder { mut world, families, places, .. } = builder;
-        let mut eye = DAffine3::IDENTITY;
+        let mut camera_pose = DAffine3::IDENTITY;
         for _ in 0..40 {
             let (at, target) = match kind {
                 SceneKind::Table => over_table(&mut draw, &places),
                 SceneKind::Room => in_room(&mut draw, &world, &places),
             };
-            eye = look_at(at.as_dvec3(), target.as_dvec3());
+            camera_pose = look_at(at.as_dvec3(), target.as_dvec3());
             if is_clear(&world, at, target) {
                 break;
             }
         }
         let roll =
             f64::from(if draw.chance(0.15) { draw.between(-0.6, 0.6) } else { draw.between(-0.08, 0.08) });
-        eye.matrix3 *= DMat3::from_rotation_z(roll);
-        light(&mut draw, &mut world, &eye);
-        Self { world, kind, families, eye }
+        camera_pose.matrix3 *= DMat3::from_rotation_z(roll);
+        light(&mut draw, &mut world, &camera_pose);
+        Self { world, kind, families, camera_pose }
     }
 }
 
@@ -388,10 +388,11 @@ fn is_clear(world: &World, at: Vec3, target: Vec3) -> bool {
 }
 
 /// Lamps, light from all around, and an exposure that suits them.
-fn light(draw: &mut Draw, world: &mut World, eye: &DAffine3) {
+fn light(draw: &mut Draw, world: &mut World, camera_pose: &DAffine3) {
     let (low, high) = world.room;
     let count = 1 + draw.weighted(&[0.35, 0.35, 0.2, 0.1]);
-    let middle = (eye.translation + eye.matrix3.z_axis * 0.8).as_vec3().clamp(low + 0.1, high - 0.1);
+    let middle =
+        (camera_pose.translation + camera_pose.matrix3.z_axis * 0.8).as_vec3().clamp(low + 0.1, high - 0.1);
     let direct = draw.between(0.35, 1.0);
     let parts: Vec<f32> = (0..count).map(|_| draw.between(0.3, 1.0)).collect();
     let sum: f32 = parts.iter().sum();
@@ -402,7 +403,7 @@ fn light(draw: &mut Draw, world: &mut World, eye: &DAffine3) {
             draw.between(1.0, high.z - 0.15),
         );
         // Never between the camera and what it sees.
-        if (center - eye.translation.as_vec3()).length() < 0.5 {
+        if (center - camera_pose.translation.as_vec3()).length() < 0.5 {
             center.z = high.z - 0.1;
         }
         let warm = draw.unit();

@@ -49,6 +49,8 @@ pub enum Sensor {
 /// A mesh of a user: triangles of corners, metres or any other unit; z is up.
 #[derive(Debug, Clone, Default)]
 pub struct TriangleMesh {
+    /// Its name in messages, such as its file.
+    pub name: String,
     /// Corners.
     pub corners: Vec<[f32; 3]>,
     /// Three corners' numbers each.
@@ -134,7 +136,7 @@ impl Generator {
         let models = settings.cameras.iter().map(|name| {
             models::find(name).ok_or_else(|| {
                 let names: Vec<_> = MODELS.iter().map(|m| m.name).collect();
-                bad(format!("there is no camera model \"{name}\"; there are {}", names.join(", ")))
+                bad(format!("invalid camera model \"{name}\"; use {}", names.join(", ")))
             })
         });
         let models = models.collect::<Result<Vec<_>>>()?;
@@ -152,10 +154,15 @@ impl Generator {
         if settings.families.contains(&Family::Mesh) && settings.meshes.is_empty() {
             return Err(bad("the family \"mesh\" needs meshes; give a folder of OBJ files".into()));
         }
-        let meshes = settings.meshes.iter().enumerate();
-        let meshes = meshes
-            .map(|(i, mesh)| unit_mesh(mesh).ok_or_else(|| bad(format!("mesh {i} is damaged or empty"))));
-        let meshes = meshes.collect::<Result<Vec<_>>>()?;
+        let checked = |mesh: &TriangleMesh| {
+            unit_mesh(mesh).ok_or_else(|| {
+                let name = &mesh.name;
+                bad(format!(
+                    "mesh {name} has faces without corners, no extent or corners that are not finite; repair or remove it"
+                ))
+            })
+        };
+        let meshes = settings.meshes.iter().map(checked).collect::<Result<Vec<_>>>()?;
         let stock = Stock { families: settings.families.clone(), meshes };
         Ok(Self { settings, models, stock })
     }
@@ -172,12 +179,12 @@ impl Generator {
     pub fn sample(&self, number: u64) -> Result<Triplet> {
         let Settings { seed, width, height, sensor, .. } = self.settings;
         let model = self.models[(number % self.models.len() as u64) as usize];
-        let RandomWorld { world, kind, families, eye } = RandomWorld::new(seed, number, &self.stock);
+        let RandomWorld { world, kind, families, camera_pose } = RandomWorld::new(seed, number, &self.stock);
         let optics = Optics::new(model, seed, number, (width, height));
         let noise = mix(seed ^ mix(number.wrapping_add(0x5CE4E)));
 
         let rays = Rays::new(&optics.color, width, height);
-        let view = View::new(&rays, &(eye * model.color_in_device.to_affine()));
+        let view = View::new(&rays, &(camera_pose * model.color_in_device.to_affine()));
         let mets = view.cast(&world);
         let color = color::render_met(&world, &view, &mets, model.white, noise);
         let truth = mets.iter().map(|m| if *m == NOTHING { 0 } else { depth::counts(m.t, TRUTH_UNIT_M) });
@@ -190,7 +197,7 @@ impl Generator {
         );
         let is_physical = sensor == Sensor::Stereo && matches!(model.depth, DepthPrinciple::Stereo { .. });
         let depth_rays = (!is_same).then(|| Rays::new(&optics.depth, w, h));
-        let depth_view = depth_rays.as_ref().map_or(view, |rays| View::new(rays, &eye));
+        let depth_view = depth_rays.as_ref().map_or(view, |rays| View::new(rays, &camera_pose));
         let sensed = if is_physical {
             ir::measure(&world, &depth_view, model, noise)?
         } else if is_same {

@@ -63,7 +63,7 @@ impl Family {
         }
     }
 
-    /// How often it is chosen among all.
+    /// Weight of the choice among all.
     pub(crate) const fn weight(self) -> f32 {
         match self {
             Self::Box => 1.6,
@@ -89,7 +89,7 @@ impl FromStr for Family {
     fn from_str(text: &str) -> Result<Self, String> {
         Self::ALL.into_iter().find(|f| f.name().eq_ignore_ascii_case(text)).ok_or_else(|| {
             let names = Self::ALL.map(Self::name).join(", ");
-            format!("there is no family \"{text}\"; there are {names}")
+            format!("invalid family \"{text}\"; use {names}")
         })
     }
 }

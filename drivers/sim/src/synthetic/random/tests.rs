@@ -16,7 +16,7 @@ fn stock() -> Stock {
     Stock { families: Family::ALL.to_vec(), meshes: vec![Arc::new(mesh)] }
 }
 
-/// How far inside a solid a point is, by the shape's definition: positive within.
+/// Distance of a point from the border of a solid, by the shape's definition: positive within.
 fn inside(solid: &Solid, p: DVec3) -> bool {
     let q = solid.axes.as_dmat3().transpose() * (p - solid.center.as_dvec3());
     let f = f64::from;
@@ -107,8 +107,8 @@ fn true_depth_is_that_of_the_slow_model() {
     let mut wrong = Vec::new();
     let mut tried = 0;
     for number in 0..36 {
-        let RandomWorld { world, eye, .. } = RandomWorld::new(11, number, &stock);
-        let view = View::new(&rays, &eye);
+        let RandomWorld { world, camera_pose, .. } = RandomWorld::new(11, number, &stock);
+        let view = View::new(&rays, &camera_pose);
         let mets = view.cast(&world);
         for y in (1..60).step_by(5) {
             for x in (1..80).step_by(5) {
@@ -154,8 +154,8 @@ fn rays_of_tiles_meet_what_rays_alone_meet() {
     let stock = stock();
     let rays = Rays::new(&Intrinsics::pinhole(60.0, 60.0, 47.5, 31.5), 96, 64);
     for number in 0..8 {
-        let RandomWorld { world, eye, .. } = RandomWorld::new(3, number, &stock);
-        let view = View::new(&rays, &eye);
+        let RandomWorld { world, camera_pose, .. } = RandomWorld::new(3, number, &stock);
+        let view = View::new(&rays, &camera_pose);
         let mets = view.cast(&world);
         let all = world.all();
         for (i, met) in mets.iter().enumerate() {
@@ -193,8 +193,8 @@ fn cameras_stand_free_and_at_the_distances_of_their_kind() {
     let mut tables = 0;
     let mut good = 0;
     for number in 0..120 {
-        let RandomWorld { world, eye, kind, .. } = RandomWorld::new(8, number, &stock);
-        let view = View::new(&rays, &eye);
+        let RandomWorld { world, camera_pose, kind, .. } = RandomWorld::new(8, number, &stock);
+        let view = View::new(&rays, &camera_pose);
         let mut z: Vec<f32> = view.cast(&world).iter().map(|m| m.t).collect();
         z.sort_by(f32::total_cmp);
         let middle = z[z.len() / 2];

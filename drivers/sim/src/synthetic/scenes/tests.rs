@@ -99,6 +99,6 @@ fn wrong_settings_are_refused() {
     assert!(refused(Settings { width: 8, ..settings(&["d435"]) }).contains("8x144"));
     let meshes = Settings { families: vec![Family::Mesh], ..settings(&["d435"]) };
     assert!(refused(meshes.clone()).contains("OBJ"));
-    let bad = TriangleMesh { corners: vec![[0.0; 3]; 3], triangles: vec![[0, 1, 3]] };
-    assert!(refused(Settings { meshes: vec![bad], ..meshes }).contains("damaged"));
+    let bad = TriangleMesh { name: "cup.obj".into(), corners: vec![[0.0; 3]; 3], triangles: vec![[0, 1, 3]] };
+    assert!(refused(Settings { meshes: vec![bad], ..meshes }).contains("cup.obj"));
 }
