@@ -60,7 +60,7 @@ pub use compare::{
 };
 pub use dataset::{
     AttachedCalibration, Dataset, DatasetFrame, DatasetInfo, DatasetSet, MotionInfo, PixelFilter, PixelMode,
-    SetRange, SetReader, Sets, SpreadStats, StreamInfo, jpeg_pixels,
+    SetRange, SetReader, Sets, SpreadStats, StreamInfo, jpeg_pixels, segment_number,
 };
 pub use error::{Error, ErrorKind, Result};
 pub use frame::{

@@ -18,6 +18,7 @@ mod image_file;
 mod install;
 mod live;
 mod logging;
+mod machines;
 mod out;
 mod outfile;
 mod printable;

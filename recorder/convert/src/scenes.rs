@@ -4,6 +4,7 @@
 //! is left alone, and sample `i` depends on the run's arguments and `i` alone: so a run that was killed goes on where
 //! it was, and any part can be made on any computer with the same bytes.
 
+use crate::store::{Place, Remote};
 use core::sync::atomic::{AtomicU64, Ordering};
 use depthrig_bus::HostTime;
 use depthrig_bus::clock::process_cpu_ns;
@@ -31,6 +32,8 @@ const BATCH: usize = 8;
 pub struct Plan {
     /// Folder of the shards; made when missing.
     pub folder: PathBuf,
+    /// Where each shard goes from there, if they go to a bucket.
+    pub remote: Option<Remote>,
     /// First part of the shards' names.
     pub name: String,
     /// Samples of the whole run.
@@ -72,7 +75,28 @@ impl Plan {
 
     /// Path of a shard.
     pub fn path(&self, shard: u64) -> PathBuf {
-        self.folder.join(format!("{}-{shard:06}.tar", self.name))
+        self.folder.join(self.file(shard))
+    }
+
+    /// Whether a shard is there and complete; an object is complete or not there.
+    fn is_whole(&self, shard: u64) -> Result<bool> {
+        match &self.remote {
+            None => Ok(tar::is_whole(&self.path(shard), self.samples(shard))),
+            Some(remote) => Ok(remote.size(&self.file(shard))?.is_some()),
+        }
+    }
+
+    /// Moves a complete shard to the bucket. If another machine has put it meanwhile, that one stays: it has the same bytes.
+    fn hand_over(&self, shard: u64) -> Result<()> {
+        let Some(remote) = &self.remote else { return Ok(()) };
+        let path = self.path(shard);
+        remote.put_file(&path, &self.file(shard))?;
+        std::fs::remove_file(&path).map_err(|e| Error::io("remove", &path, e))
+    }
+
+    /// Name of a shard's file.
+    fn file(&self, shard: u64) -> String {
+        format!("{}-{shard:06}.tar", self.name)
     }
 
     /// Numbers of the samples in a shard.
@@ -102,8 +126,12 @@ pub fn write(
     let start = HostTime::now();
     let cpu = process_cpu_ns();
     let mine: Vec<u64> = (0..plan.shards()).filter(|s| s % plan.part.1 == plan.part.0).collect();
-    let is_missing = |s: &u64| !tar::is_whole(&plan.path(*s), plan.samples(*s));
-    let missing: Vec<u64> = mine.iter().copied().filter(is_missing).collect();
+    let mut missing = Vec::new();
+    for shard in &mine {
+        if !plan.is_whole(*shard)? {
+            missing.push(*shard);
+        }
+    }
     let found = mine.len() - missing.len();
     let mut report = Report { shards: mine.len() as u64, shards_found: found as u64, ..Report::default() };
     let length = |s: &u64| plan.samples(*s).end - plan.samples(*s).start;
@@ -121,6 +149,7 @@ pub fn write(
             go_on
         })?;
         if let Some(bytes) = made {
+            plan.hand_over(shard)?;
             done += length(&shard);
             report.samples += length(&shard);
             report.bytes += bytes;
@@ -218,24 +247,12 @@ fn record(generator: &Generator, plan: &Plan) -> Result<()> {
         samples: plan.count,
         shards: plan.shards(),
     };
-    let path = plan.folder.join(format!("{}.json", plan.name));
+    let name = format!("{}.json", plan.name);
+    let place = plan.remote.clone().map_or_else(|| Place::Local(plan.folder.clone()), Place::Remote);
     let mut text = serde_json::to_string_pretty(&record)
-        .map_err(|e| Error::new(ErrorKind::BadInput, format!("{}: {e}", path.display())))?;
+        .map_err(|e| Error::new(ErrorKind::BadInput, format!("{place}/{name}: {e}")))?;
     text.push('\n');
-    match depthrig_bus::files::read_to_string(&path, depthrig_bus::files::TEXT_MAX_BYTES) {
-        Ok(there) if there == text => Ok(()),
-        Ok(_) => Err(Error::new(
-            ErrorKind::BadInput,
-            format!(
-                "{} is of a run with other arguments or another version; give this run another folder or --name",
-                path.display()
-            ),
-        )),
-        Err(e) if e.kind() == io::ErrorKind::NotFound => {
-            depthrig_bus::files::replace(&path, text.as_bytes()).map_err(|e| Error::io("write", &path, e))
-        }
-        Err(e) => Err(Error::reading("read", &path, e)),
-    }
+    place.agree_on(&name, text.as_bytes(), "give this run another folder or --name")
 }
 
 /// Pools of one thread each: a sample is made on one thread, and several at once.

@@ -2,13 +2,16 @@
 
 use crate::context::Context;
 use crate::exit::{Exit, UsageError};
+use crate::machines::{Scratch, part, path_of};
 use crate::out;
 use crate::outfile::{OutFile, Overwrite};
 use crate::progress::Progress;
 use crate::signals::Stop;
+use crate::watched::usage;
 use anyhow::{Result, bail};
 use clap::ValueEnum;
 use depthrig_convert::scenes::{self, Plan, contact_sheet};
+use depthrig_convert::store::Place;
 use depthrig_sim::synthetic::scenes::{Family, Generator, Sensor, Settings, TriangleMesh, Triplet};
 use std::path::{Path, PathBuf};
 
@@ -34,7 +37,7 @@ Examples:
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct ScenesArgs {
-    /// Folder of the shards
+    /// Folder of the shards, or s3://BUCKET/PREFIX
     #[arg(long, value_name = "DIR", required_unless_present = "preview")]
     out: Option<PathBuf>,
     /// Seed of the run
@@ -67,6 +70,8 @@ pub struct ScenesArgs {
     /// Part of the run to make: K of N, from 0
     #[arg(long, value_name = "K/N", default_value = "0/1", value_parser = part)]
     shard: [u64; 2],
+    #[command(flatten)]
+    scratch: Scratch,
     /// First part of the shards' names
     #[arg(long, value_name = "NAME", default_value = "scenes")]
     name: String,
@@ -100,14 +105,6 @@ fn size(text: &str) -> Result<[u32; 2], String> {
     Ok([w.parse().map_err(|_| wrong())?, h.parse().map_err(|_| wrong())?])
 }
 
-/// Parses a part such as `2/8`.
-fn part(text: &str) -> Result<[u64; 2], String> {
-    let wrong = || format!("write a part such as 2/8 (0/8 to 7/8), not \"{text}\"");
-    let (k, n) = text.split_once('/').ok_or_else(wrong)?;
-    let [k, n] = [k.parse().map_err(|_| wrong())?, n.parse().map_err(|_| wrong())?];
-    if k < n && n <= 1_000_000 { Ok([k, n]) } else { Err(wrong()) }
-}
-
 /// Makes the samples.
 pub fn run(args: &ScenesArgs, context: &Context) -> Result<Exit> {
     let generator = Generator::new(settings(args)?).map_err(|e| UsageError(e.to_string()))?;
@@ -127,10 +124,17 @@ pub fn run(args: &ScenesArgs, context: &Context) -> Result<Exit> {
         bar.clear();
         preview.write(&contact_sheet(&samples, generator.settings())?)?;
     }
-    let Some(folder) = &args.out else { return Ok(Exit::Good) };
+    let Some(out) = &args.out else { return Ok(Exit::Good) };
+    let place = Place::parse(out).map_err(usage)?;
+    let scratch = args.scratch.folder(&[&place])?;
+    let (folder, remote) = match place {
+        Place::Local(folder) => (folder, None),
+        Place::Remote(remote) => (path_of(scratch.as_ref()), Some(remote)),
+    };
     let cores = || std::thread::available_parallelism().map_or(1, usize::from);
     let plan = Plan {
-        folder: folder.clone(),
+        folder,
+        remote,
         name: args.name.clone(),
         count: args.count,
         per_shard: args.per_shard,
@@ -142,10 +146,7 @@ pub fn run(args: &ScenesArgs, context: &Context) -> Result<Exit> {
         !stop.is_asked()
     });
     bar.clear();
-    let report = report.map_err(|e| match e.kind() {
-        depthrig_recorder::ErrorKind::BadInput => UsageError(e.to_string()).into(),
-        _ => anyhow::Error::new(e),
-    })?;
+    let report = report.map_err(usage)?;
     if args.json {
         out::json(&report)?;
     } else {
@@ -223,11 +224,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn parts_and_sizes_are_checked() {
-        assert_eq!(part("2/8"), Ok([2, 8]));
-        for bad in ["8/8", "1", "-1/2", "a/b", "0/0", "1/2/3", "1/1000001"] {
-            assert!(part(bad).unwrap_err().contains("2/8"), "{bad}");
-        }
+    fn sizes_are_checked() {
         assert_eq!(size("640x480"), Ok([640, 480]));
         for bad in ["640", "640x", "x", "640x480x3", "-1x4"] {
             assert!(size(bad).unwrap_err().contains("640x480"), "{bad}");

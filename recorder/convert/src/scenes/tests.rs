@@ -7,7 +7,15 @@ fn generator() -> Generator {
 }
 
 fn plan(folder: &Path) -> Plan {
-    Plan { folder: folder.to_owned(), name: "t".into(), count: 7, per_shard: 3, part: (0, 1), threads: 2 }
+    Plan {
+        folder: folder.to_owned(),
+        remote: None,
+        name: "t".into(),
+        count: 7,
+        per_shard: 3,
+        part: (0, 1),
+        threads: 2,
+    }
 }
 
 fn go(plan: &Plan) -> Report {
