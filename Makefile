@@ -22,7 +22,7 @@ OAK := .venv-oak
 ROBOTS := .venv-robots
 # mdBook, which makes the site of the documents.
 DOCS := .venv-docs
-REQUIREMENTS := python/requirements-test.txt $(READERS)/requirements.txt tests/page_browser/requirements.txt tests/terminal/requirements.txt
+REQUIREMENTS := python/requirements-test.txt tests/python/requirements-s3.txt $(READERS)/requirements.txt tests/page_browser/requirements.txt tests/terminal/requirements.txt
 
 .PHONY: help demo demo-calibration environments test check-debian13 test-long vm fuzz lint docs dist test-dist bench bench-page bench-peers bench-feed clean setup-build setup-test setup-vm setup-peers setup-fuzz setup-dist
 
