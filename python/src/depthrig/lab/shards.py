@@ -125,16 +125,29 @@ class Shard:
     def __len__(self) -> int:
         return len(self.entries)
 
-    def __getitem__(self, index: int) -> Sample:
+    def _read(self, index: int, only: str = "") -> dict[str, bytes]:
         entry = self.entries[index]
         with self.path.open("rb") as file:
             members = {}
             for what, (at, size) in entry.members.items():
+                if only and what != only:
+                    continue
                 file.seek(at)
                 members[what] = file.read(size)
                 if len(members[what]) != size:
                     raise LabError(f"{self.path}: cut short within {entry.key}.{what}; make this shard again")
-        return read_sample(members, f"{self.path}: sample {entry.key}")
+        return members
+
+    def __getitem__(self, index: int) -> Sample:
+        return read_sample(self._read(index), f"{self.path}: sample {self.entries[index].key}")
+
+    def facts(self, index: int) -> dict[str, Any]:
+        """Return what the json of a sample says, such as `sensor` and `scene`."""
+        try:
+            facts = json.loads(self._read(index, "json")["json"])
+        except ValueError as e:
+            raise LabError(f"{self.path}: sample {self.entries[index].key}: invalid json: {e}") from None
+        return facts if isinstance(facts, dict) else {}
 
 
 def read_sample(members: dict[str, bytes], where: str) -> Sample:
