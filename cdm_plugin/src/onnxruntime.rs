@@ -19,10 +19,21 @@ pub mod device;
 mod library;
 pub mod runtime;
 pub mod session;
+mod tiny;
 mod weights;
+
+pub use tiny::TinyNetwork;
 
 /// As many bytes as the name of an engine may have.
 const NAME_BYTES: usize = 31;
+
+/// Where the library is that `device` would run on, without a look into it; arguments and errors as [`find_library`].
+///
+/// # Errors
+/// [`ErrorKind::NoEngine`] when it is missing, [`ErrorKind::BadInput`] for an unknown device.
+pub fn library_file(wanted: Option<&Path>, device: &str) -> Result<PathBuf> {
+    library::find(wanted, std::env::var_os(library::VARIABLE).as_deref(), &device.parse()?)
+}
 
 /// The version of the library that `device` would run on and where it is, without binding this process to it. `wanted` is
 /// the library or its folder; it is looked for without.
@@ -205,17 +216,22 @@ const fn style(device: &Device, precision: Precision) -> Style {
 
 /// `onnxruntime 1.31.1 cpu fp32`; with less of the version and of the device when that is too long for a header.
 pub fn describe(version: &str, device: &Device, precision: Precision) -> String {
-    let full = format!("onnxruntime {version} {device} {precision}");
+    describe_as("onnxruntime", version, device, precision)
+}
+
+/// As [`describe`], for another name of the engine.
+fn describe_as(engine: &str, version: &str, device: &Device, precision: Precision) -> String {
+    let full = format!("{engine} {version} {device} {precision}");
     if full.len() <= NAME_BYTES {
         return full;
     }
     let version: Vec<&str> = version.split('.').take(2).collect();
     let mut device = device.to_string();
     device.truncate(device.find(':').unwrap_or(device.len()));
-    let room = NAME_BYTES.saturating_sub("onnxruntime   ".len() + device.len() + precision.name().len());
+    let room = NAME_BYTES.saturating_sub(engine.len() + 3 + device.len() + precision.name().len());
     let mut version = version.join(".");
     version.truncate(room);
-    format!("onnxruntime {version} {device} {precision}")
+    format!("{engine} {version} {device} {precision}")
 }
 
 /// Maps an error of the library.

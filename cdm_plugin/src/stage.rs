@@ -8,7 +8,7 @@ pub mod pixels;
 mod settings;
 mod view;
 
-pub use engines::{Installed, Opened, Plan, Refiners, missing};
+pub use engines::{Installed, Opened, Plan, Refiners};
 pub use header::derived_header;
 pub use settings::{CdmConfig, EngineChoice, RefineConfig, RefineModel};
 pub use view::{Correct, View};

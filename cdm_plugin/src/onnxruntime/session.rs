@@ -62,6 +62,15 @@ pub fn open_file(runtime: &Runtime, file: &Path, device: &Device, threads: usize
     builder.commit_from_file(file).map_err(error)
 }
 
+/// Loads the network of these bytes onto the CPU, for an engine of this name.
+///
+/// # Errors
+/// As [`open`].
+pub fn open_bytes(runtime: &Runtime, bytes: &[u8], name: &str, threads: usize) -> Result<Session> {
+    let mut builder = builder(runtime, threads).map_err(|e| failed(name, "loading the model", &e))?;
+    builder.commit_from_memory(bytes).map_err(|e| failed(name, "loading the model", &e))
+}
+
 fn builder(runtime: &Runtime, threads: usize) -> ort::Result<SessionBuilder> {
     Session::builder(&runtime.environment)?
         .with_optimization_level(GraphOptimizationLevel::All)
