@@ -50,6 +50,11 @@ pub trait Network: Send {
         1
     }
 
+    /// Whether the first run at a shape takes much longer than the others.
+    fn warms_up(&self) -> bool {
+        false
+    }
+
     /// Gets ready for inputs of `shape`; called before the first [`Self::run`] at it, and again after another shape was
     /// prepared: images of two sizes may take turns.
     ///

@@ -17,6 +17,8 @@ use weights::BoundWeights;
 
 pub mod device;
 mod library;
+mod nvidia;
+mod providers;
 pub mod runtime;
 pub mod session;
 mod tiny;
@@ -82,12 +84,13 @@ impl OnnxNetwork {
     /// device or the precision, [`ErrorKind::BadInput`] for an unknown device, [`ErrorKind::BadModel`] when a tensor
     /// is missing, [`ErrorKind::OutOfMemory`] and [`ErrorKind::Engine`].
     pub fn open(model: &Model, options: &RefinerOptions) -> Result<Self> {
-        Self::with_architecture(model.encoder.architecture(), &model.weights, options)
+        Self::with_architecture(model.encoder.architecture(), &model.weights, &model.id, options)
     }
 
     fn with_architecture(
         arch: Architecture,
         weights: &Arc<Weights>,
+        id: &str,
         options: &RefinerOptions,
     ) -> Result<Self> {
         let device: Device = options.device.parse()?;
@@ -96,7 +99,7 @@ impl OnnxNetwork {
         let graph = Graph::of_architecture(arch, style(&device, options.precision));
         let weights = BoundWeights::new(weights, &graph.weights)?;
         let threads = options.thread_count();
-        let session = session::open(&runtime, &graph, &weights, &device, options.precision, threads)?;
+        let session = session::open(&runtime, &graph, (&weights, id), &device, options.precision, threads)?;
         let description = describe(&runtime.version, &device, options.precision);
         Ok(Self { description, device, bound: None, session, _weights: weights })
     }
@@ -138,6 +141,11 @@ impl Network for OnnxNetwork {
             // Not measured: there was no GPU.
             Device::Cuda(_) | Device::TensorRt(_) => 4,
         }
+    }
+
+    fn warms_up(&self) -> bool {
+        // They compile for each shape. ONNX Runtime itself only makes room, and one image may take seconds.
+        self.device != Device::Cpu
     }
 
     fn prepare(&mut self, shape: NetShape, positions: &PositionEmbeddings) -> Result<()> {
@@ -237,6 +245,11 @@ fn describe_as(engine: &str, version: &str, device: &Device, precision: Precisio
 /// Maps an error of the library.
 pub fn failed(engine: &str, what: &str, error: &ort::Error) -> Error {
     let text = error.message();
+    if let Some((library, cure)) = nvidia::missing(text) {
+        let message =
+            format!("{engine}: {what} failed, because the library {library} is not there: {cure} ({text})");
+        return Error::new(ErrorKind::NoEngine, message);
+    }
     if is_memory(text) {
         let message = format!(
             "{engine}: {what} needs more memory than the device has left ({text}); use a smaller input_size, a smaller \

@@ -78,6 +78,10 @@ impl Refiner for TinyRefiner {
         &self.description
     }
 
+    fn warms_up(&self) -> bool {
+        true
+    }
+
     fn refine(&mut self, jobs: &mut [Job<'_>]) -> Result<()> {
         jobs.iter_mut().try_for_each(|job| self.run(job))
     }
