@@ -104,7 +104,7 @@ pub(super) fn missing(text: &str) -> Option<(String, String)> {
     let name = name.rsplit('/').next()?;
     let of =
         |stem: &&str| name.strip_prefix(*stem).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'));
-    let cure = if DRIVER.iter().any(|stem| of(&stem)) {
+    let cure = if DRIVER.iter().any(of) {
         "it is part of NVIDIA's driver: install that, and see that `nvidia-smi` lists the GPU".to_owned()
     } else {
         let known = CUDA.iter().chain(&TENSORRT).find(|n| of(&n.stem));
@@ -138,7 +138,7 @@ mod tests {
         let path = folder.join(soname);
         let mut cc = Command::new("cc");
         cc.args(["-shared", "-fPIC", "-o"]).arg(&path).arg(&c).arg(format!("-Wl,-soname,{soname}"));
-        cc.args(linked.iter().map(|path| path.to_string()));
+        cc.args(linked.iter().map(ToString::to_string));
         assert!(cc.status().unwrap().success());
         std::fs::remove_file(c).unwrap();
         path
@@ -174,7 +174,7 @@ mod tests {
             "int made_blas(void); int made(void) { return 1 + made_blas(); }",
         );
         // SAFETY: a library of this test.
-        let early = unsafe { libloading::Library::new(&provider) }.err().expect("nothing is loaded yet");
+        let early = unsafe { libloading::Library::new(&provider) }.expect_err("nothing is loaded yet");
         let (name, cure) = missing(&cause(&early)).expect("the loader names what is missing");
         assert_eq!(name, "libcublas.so.13", "{early}");
         assert!(cure.contains("pip install nvidia-cublas"), "{cure}");

@@ -79,17 +79,15 @@ impl TinyNetwork {
 
 impl ImageNetwork for TinyNetwork {
     fn inputs(&mut self, width: usize, height: usize) -> Result<(&mut [f32], &mut [f32])> {
-        match self.bound.iter().position(|b| (b.width, b.height) == (width, height)) {
+        if let Some(at) = self.bound.iter().position(|b| (b.width, b.height) == (width, height)) {
             // To the end, where the last one is; within the list's own memory.
-            Some(at) => self.bound[at..].rotate_left(1),
-            None => {
-                let bound =
-                    self.bind(width, height).map_err(|e| failed(&self.description, "making room", &e))?;
-                if self.bound.len() == SIZES {
-                    self.bound.remove(0);
-                }
-                self.bound.push(bound);
+            self.bound[at..].rotate_left(1);
+        } else {
+            let bound = self.bind(width, height).map_err(|e| failed(&self.description, "making room", &e))?;
+            if self.bound.len() == SIZES {
+                self.bound.remove(0);
             }
+            self.bound.push(bound);
         }
         let bound = self.bound.last_mut().ok_or_else(|| not_bound(&self.description))?;
         Ok((bound.x.extract_tensor_mut().1, bound.filled.extract_tensor_mut().1))

@@ -60,11 +60,15 @@ pub(super) fn write(
             }),
             4 => rows(x, &|y, out| {
                 raw(y, out);
-                out.iter_mut().for_each(|q| *q *= per_mean);
+                for q in out {
+                    *q *= per_mean;
+                }
             }),
             _ => rows(x, &|y, out| {
                 raw(y, out);
-                out.iter_mut().for_each(|q| *q = if *q > 0.0 { 1.0 } else { 0.0 });
+                for q in out {
+                    *q = if *q > 0.0 { 1.0 } else { 0.0 };
+                }
             }),
         }
     }

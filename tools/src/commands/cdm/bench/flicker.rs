@@ -118,7 +118,9 @@ mod tests {
     #[test]
     fn a_pixel_without_depth_in_one_image_has_no_deviation() {
         let mut pixel = Pixel::default();
-        [1000.0, 1002.0, 0.0].into_iter().for_each(|mm| pixel.add(mm));
+        for mm in [1000.0, 1002.0, 0.0] {
+            pixel.add(mm);
+        }
         assert_eq!(pixel.deviation(3), None);
         pixel.add(1004.0);
         assert!((pixel.deviation(3).unwrap() - 2.0).abs() < 1e-6);
