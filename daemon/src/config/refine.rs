@@ -12,9 +12,10 @@ pub(super) const TABLE: &str = "[camera.refine]";
 /// The streams that it makes.
 pub(super) const COMPUTED: [&str; 2] = [depthrig_cdm::stage::REFINED, depthrig_cdm::stage::ALIGNED];
 
-const ENGINES: [(&str, EngineChoice); 4] = [
+const ENGINES: [(&str, EngineChoice); 5] = [
     ("auto", EngineChoice::Auto),
     ("fill", EngineChoice::Fill),
+    ("tiny", EngineChoice::Tiny),
     ("onnxruntime", EngineChoice::OnnxRuntime),
     ("off", EngineChoice::Off),
 ];
@@ -64,15 +65,25 @@ pub(super) fn read(
         }),
     };
     let at = s.at;
-    if present && config.engine == EngineChoice::Fill && config.model.is_some() {
-        let at = s.at_key("model");
-        s.problem(
-            at,
-            format!(
-                "{} has no use: the engine \"fill\" needs no model; remove one of the two",
-                s.key_of("model")
-            ),
-        );
+    let bare = match config.engine {
+        EngineChoice::Fill => Some("fill"),
+        EngineChoice::Tiny => Some("tiny"),
+        _ => None,
+    };
+    let useless = |key: &'static str, why: String| {
+        let at = s.at_key(key);
+        s.problem(at, format!("{} has no use: {why}; remove one of the two", s.key_of(key)));
+    };
+    if let Some(engine) = bare.filter(|_| present && config.model.is_some()) {
+        useless("model", format!("the engine \"{engine}\" needs no model"));
+    }
+    if present && config.engine == EngineChoice::Tiny {
+        if config.device != "cpu" {
+            useless("device", "the engine \"tiny\" runs on the CPU".to_owned());
+        }
+        if config.precision != Precision::Fp32 {
+            useless("precision", "the engine \"tiny\" computes in fp32".to_owned());
+        }
     }
     s.finish();
     if !present {
