@@ -109,6 +109,8 @@ pub struct RefinerOptions {
     pub engine: Option<EngineKind>,
     /// The model that `onnxruntime` runs.
     pub model: Option<Model>,
+    /// The network that `tiny` runs in place of the one of this program.
+    pub tiny: Option<crate::tiny::TinyFile>,
     /// The shorter side of the network's input, pixels, at least 14; `None` is [`Model::input_size`].
     pub input_size: Option<u32>,
     /// The numbers that the network computes with.
@@ -128,6 +130,7 @@ impl Default for RefinerOptions {
         Self {
             engine: None,
             model: None,
+            tiny: None,
             input_size: None,
             precision: Precision::Fp32,
             device: "cpu".into(),

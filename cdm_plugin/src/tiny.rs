@@ -17,7 +17,7 @@ use depthrig_bus::HostTime;
 mod model;
 mod planes;
 
-pub use model::{RECORD, TinyModel, model};
+pub use model::{RECORD, TinyFile, TinyModel, is_tiny_file, model};
 
 /// The refiner that is the network `tiny` with `fill` before it.
 ///
@@ -29,20 +29,23 @@ pub struct TinyRefiner {
 }
 
 impl TinyRefiner {
-    /// The refiner with the network that is part of the program; `options` give threads, library and reach.
+    /// The refiner with the network of `options`, else the one that is part of the program; `options` give threads, library and
+    /// reach too.
     ///
     /// # Errors
     /// [`crate::ErrorKind::NoEngine`] when ONNX Runtime is not found, [`crate::ErrorKind::Unsupported`] for another device
     /// than `cpu` or another precision than `fp32`, and those of the library.
     pub fn open(options: &RefinerOptions) -> Result<Self> {
-        let network = TinyNetwork::open(model::BYTES, options)?;
+        let bytes = options.tiny.as_ref().map_or(model::BYTES, |own| &own.bytes);
+        let network = TinyNetwork::open(bytes, options)?;
         let engine = network.describe().to_owned();
         Self::new(Box::new(network), engine, options)
     }
 
     fn new(network: Box<dyn ImageNetwork>, engine: String, options: &RefinerOptions) -> Result<Self> {
         let fill = FillRefiner::new(options.thread_count())?.with_reach(options.fill_reach);
-        Ok(Self { description: Description { engine, model: model().id.clone() }, fill, network })
+        let model = options.tiny.as_ref().map_or_else(|| model().id.clone(), |own| own.id.clone());
+        Ok(Self { description: Description { engine, model }, fill, network })
     }
 
     fn run(&mut self, job: &mut Job<'_>) -> Result<()> {

@@ -128,6 +128,7 @@ impl Refiners for Installed {
         match config.engine {
             EngineChoice::Fill | EngineChoice::Off => bare(EngineKind::Fill, config.fill_reach, None),
             EngineChoice::Tiny => Plan {
+                model: config.model.clone(),
                 precision: config.precision,
                 device: config.device.clone(),
                 ..bare(EngineKind::Tiny, config.fill_reach, None)
@@ -179,10 +180,14 @@ const fn stands_in(kind: ErrorKind) -> bool {
 
 impl Installed {
     fn make(&self, plan: &Plan, threads: usize) -> Result<Box<dyn Refiner>> {
-        let model = plan.model.as_ref().map(|m| super::models::open(&self.cdm, m)).transpose()?;
+        let own = plan.model.as_ref().filter(|_| plan.engine == EngineKind::Tiny);
+        let tiny = own.map(super::models::open_tiny).transpose()?;
+        let model = plan.model.as_ref().filter(|_| own.is_none());
+        let model = model.map(|m| super::models::open(&self.cdm, m)).transpose()?;
         crate::refiner(&RefinerOptions {
             engine: Some(plan.engine),
             model,
+            tiny,
             input_size: plan.input_size,
             precision: plan.precision,
             device: plan.device.clone(),

@@ -2,14 +2,18 @@
 
 use crate::durable::hex;
 use crate::model::model_id;
+use crate::{Error, ErrorKind, Result};
 use serde::Deserialize;
 use sha2::{Digest, Sha256};
-use std::sync::OnceLock;
+use std::path::Path;
+use std::sync::{Arc, OnceLock};
 
 /// The network: ONNX, `python/src/depthrig/lab/nets/export.py`.
 pub(super) const BYTES: &[u8] = include_bytes!("../../models/tiny.onnx");
 /// The record of its training, TOML: data, settings, and how good it is.
 pub const RECORD: &str = include_str!("../../models/tiny.toml");
+/// Larger networks of others are refused, bytes.
+const FILE_MAX_BYTES: u64 = 64 << 20;
 
 /// The network of the program, in short.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -25,6 +29,40 @@ pub struct TinyModel {
     pub is_trained: bool,
     /// Whether `engine = "auto"` may choose it: its record says so, and is of this network.
     pub is_default: bool,
+}
+
+/// A network of this form that somebody trained for their own camera.
+#[derive(Debug, Clone)]
+pub struct TinyFile {
+    /// Id in headers and reports: the file's name without its ending, and the beginning of its hash.
+    pub id: String,
+    pub(super) bytes: Arc<[u8]>,
+}
+
+impl TinyFile {
+    /// Reads the file that `depthrig.lab.train` writes: ONNX. The form of the network is checked when it is opened.
+    ///
+    /// # Errors
+    /// [`ErrorKind::NotFound`] when the file is not there, [`ErrorKind::BadModel`] when it cannot be read or is too large.
+    pub fn read(path: &Path) -> Result<Self> {
+        let bytes = depthrig_bus::files::read(path, FILE_MAX_BYTES).map_err(|e| {
+            let missing = e.kind() == std::io::ErrorKind::NotFound;
+            let kind = if missing { ErrorKind::NotFound } else { ErrorKind::BadModel };
+            let message = format!(
+                "{}: cannot be read: {e}; name the tiny.onnx that depthrig.lab.train wrote",
+                path.display()
+            );
+            Error::new(kind, message).with_source(e)
+        })?;
+        let name = path.file_stem().map_or_else(String::new, |s| s.to_string_lossy().into_owned());
+        let id = model_id(&name, &hex(&Sha256::digest(&bytes)), true);
+        Ok(Self { id, bytes: bytes.into() })
+    }
+}
+
+/// Whether a path is one of a [`TinyFile`]: it ends in `.onnx`.
+pub fn is_tiny_file(path: &Path) -> bool {
+    path.extension().is_some_and(|e| e == "onnx")
 }
 
 /// The part of the record that the program acts on.

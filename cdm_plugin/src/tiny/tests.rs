@@ -350,3 +350,28 @@ fn other_devices_and_precisions_are_refused_with_the_cure() {
     assert_eq!(error.kind(), ErrorKind::NoEngine);
     assert!(error.to_string().contains("pip install onnxruntime"), "{error}");
 }
+
+#[test]
+fn a_network_from_a_file_runs_under_its_own_name() {
+    let home = tempfile::tempdir().unwrap();
+    let path = home.path().join("my lab.onnx");
+    std::fs::write(&path, model::BYTES).unwrap();
+    let own = TinyFile::read(&path).unwrap();
+    assert_eq!(own.id, format!("my-lab@{}", &super::model().sha256[..8]));
+    let Some(mut refiner) = real(&RefinerOptions { tiny: Some(own), ..options() }) else { return };
+    assert!(refiner.describe().model.starts_with("my-lab@"), "{:?}", refiner.describe());
+    let Some(mut usual) = real(&options()) else { return };
+    let pair = Pair::new(64, 48, 1);
+    assert_eq!(pair.inverse(&mut refiner), pair.inverse(&mut usual));
+
+    std::fs::write(&path, "no network").unwrap();
+    let bad = RefinerOptions { tiny: Some(TinyFile::read(&path).unwrap()), ..options() };
+    let error = TinyRefiner::open(&bad).err().unwrap();
+    assert!(error.to_string().contains("my-lab"), "{error}");
+    let error = TinyFile::read(&home.path().join("none.onnx")).err().unwrap();
+    assert_eq!(error.kind(), ErrorKind::NotFound);
+    assert!(
+        error.to_string().contains("none.onnx") && error.to_string().contains("depthrig.lab.train"),
+        "{error}"
+    );
+}

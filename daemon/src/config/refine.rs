@@ -5,6 +5,7 @@ use super::value::{MAX_REFINE_HZ, above_zero, not_empty, resolve, within};
 use super::wanted::WantedStream;
 use super::{CdmConfig, EngineChoice, Precision, RefineConfig, RefineModel};
 use depthrig_bus::PixelFormat;
+use depthrig_cdm::tiny;
 use std::path::{Path, PathBuf};
 
 /// The table of a camera's refined depth.
@@ -65,17 +66,19 @@ pub(super) fn read(
         }),
     };
     let at = s.at;
-    let bare = match config.engine {
-        EngineChoice::Fill => Some("fill"),
-        EngineChoice::Tiny => Some("tiny"),
-        _ => None,
-    };
     let useless = |key: &'static str, why: String| {
         let at = s.at_key(key);
         s.problem(at, format!("{} has no use: {why}; remove one of the two", s.key_of(key)));
     };
-    if let Some(engine) = bare.filter(|_| present && config.model.is_some()) {
-        useless("model", format!("the engine \"{engine}\" needs no model"));
+    let is_tiny_file = |m: &RefineModel| matches!(m, RefineModel::File(path) if tiny::is_tiny_file(path));
+    match (config.engine, &config.model) {
+        (EngineChoice::Fill, Some(_)) if present => {
+            useless("model", "the engine \"fill\" needs no model".to_owned());
+        }
+        (EngineChoice::Tiny, Some(m)) if present && !is_tiny_file(m) => {
+            useless("model", "the engine \"tiny\" runs its own network, or a file NAME.onnx".to_owned());
+        }
+        _ => {}
     }
     if present && config.engine == EngineChoice::Tiny {
         if config.device != "cpu" {

@@ -834,7 +834,12 @@ fn what_is_wrong_with_refining_is_named_at_its_line() {
         ("fill_reach = 1.5", 6, "is 1.5; it must be within 0 and 1"),
         ("format = \"rgb8\"", 6, "it is one of: z16, depth_f32"),
         ("engine = \"fill\"\nmodel = \"x\"", 7, "has no use: the engine \"fill\" needs no model"),
-        ("engine = \"tiny\"\nmodel = \"x\"", 7, "has no use: the engine \"tiny\" needs no model"),
+        (
+            "engine = \"tiny\"\nmodel = \"x\"",
+            7,
+            "has no use: the engine \"tiny\" runs its own network, or a file NAME.onnx",
+        ),
+        ("engine = \"tiny\"\nmodel = \"net.pth\"", 7, "or a file NAME.onnx"),
         ("engine = \"tiny\"\ndevice = \"cuda:0\"", 7, "has no use: the engine \"tiny\" runs on the CPU"),
         ("engine = \"tiny\"\nprecision = \"fp16\"", 7, "has no use: the engine \"tiny\" computes in fp32"),
         ("engine = \"tiy\"", 6, "has the invalid value \"tiy\"; did you mean \"tiny\"?"),

@@ -69,7 +69,8 @@ fn of_camera(config: &RigConfig, refine: &RefineConfig, plan: &Plan) -> Vec<Find
         );
         findings.push(Finding::new(Severity::Info, id, note.as_str(), why, cure));
     }
-    if plan.engine.needs_model() {
+    // `tiny` may have a network of its own.
+    if plan.engine.needs_model() || (plan.engine == EngineKind::Tiny && plan.model.is_some()) {
         let looked = plan.model.as_ref().map(|m| models::look(&config.cdm, m));
         let missing = match looked {
             Some(Ok(_)) => None,

@@ -41,7 +41,7 @@ pub struct RunArgs {
     /// Metres per unit of the raw depth
     #[arg(long, value_name = "METRES", value_parser = crate::args::depth_unit_m)]
     depth_unit: f64,
-    /// Installed model, or checkpoint file
+    /// Installed model, checkpoint file, or NAME.onnx for the engine tiny
     #[arg(long, value_name = "NAME|FILE", required_unless_present = "engine")]
     model: Option<String>,
     /// Shorter side of the network's input, pixels [default: the model's]
@@ -150,7 +150,8 @@ pub fn run(args: &RunArgs) -> Result<Exit> {
     let has_model = options.model.is_some();
     let trained = match &options.model {
         Some(model) => Some(model.is_trained()),
-        None => (options.engine_kind() == EngineKind::Tiny).then(|| tiny::model().is_trained),
+        None => (options.engine_kind() == EngineKind::Tiny)
+            .then(|| options.tiny.is_some() || tiny::model().is_trained),
     };
     let mut refiner = refiner(&options).map_err(usage)?;
     let mut refined =
@@ -368,8 +369,12 @@ fn form(args: &RunArgs) -> Result<bool> {
 }
 
 fn options(args: &RunArgs) -> Result<RefinerOptions> {
+    let file = args.model.as_deref().map(Path::new).filter(|path| tiny::is_tiny_file(path));
+    let engine = args.engine.or_else(|| file.map(|_| EngineKind::Tiny));
+    let is_tiny = engine == Some(EngineKind::Tiny);
+    let tiny = file.filter(|_| is_tiny).map(tiny::TinyFile::read).transpose().map_err(usage)?;
     let model = match &args.model {
-        Some(_) if args.engine.is_some_and(|e| !e.needs_model()) => None,
+        Some(_) if engine.is_some_and(|e| !e.needs_model()) => None,
         Some(name) => {
             let mut model = args.models.store()?.model(name).map_err(usage)?;
             if let Some(order) = args.channel_order {
@@ -383,8 +388,9 @@ fn options(args: &RunArgs) -> Result<RefinerOptions> {
         None => None,
     };
     Ok(RefinerOptions {
-        engine: args.engine,
+        engine,
         model,
+        tiny,
         input_size: args.input_size,
         precision: args.precision,
         device: args.device.clone(),
