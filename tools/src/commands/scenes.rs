@@ -101,7 +101,10 @@ fn size(text: &str) -> Result<[u32; 2], String> {
 }
 
 /// Parses a part such as `2/8`.
-fn part(text: &str) -> Result<[u64; 2], String> {
+///
+/// # Errors
+/// When it is not one.
+pub fn part(text: &str) -> Result<[u64; 2], String> {
     let wrong = || format!("write a part such as 2/8 (0/8 to 7/8), not \"{text}\"");
     let (k, n) = text.split_once('/').ok_or_else(wrong)?;
     let [k, n] = [k.parse().map_err(|_| wrong())?, n.parse().map_err(|_| wrong())?];
