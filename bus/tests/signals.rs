@@ -13,7 +13,7 @@ use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 use std::time::Duration;
 
-const WAIT: Duration = Duration::from_secs(60);
+const WAIT: Duration = Duration::from_secs(40);
 const ROLE: &str = "DEPTHRIG_BUS_TEST_ROLE";
 const DIR: &str = "DEPTHRIG_BUS_TEST_DIR";
 

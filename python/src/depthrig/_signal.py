@@ -86,7 +86,7 @@ class Signal:
         self._start = start
         self._head = ctypes.create_string_buffer(layout.SIGNAL_HEADER_SIZE)
         self._body = ctypes.create_string_buffer(start + layout.SIGNAL_MAX_VALUES_BYTES)
-        self._body[: len(text)] = text
+        ctypes.memmove(self._body, text, len(text))
         self._addresses = ctypes.addressof(self._head), ctypes.addressof(self._body)
         self.session = time.monotonic_ns()
         """Identifies this publisher in the headers of its samples."""

@@ -27,7 +27,7 @@ class SignalField(NamedTuple):
     """Its name, unique among the signal's."""
     type: str = "f64"
     """Type of its elements: `f64`, `f32`, `i64`, `bool`, or `text`, of which there is one at most, as the last field."""
-    count: int = 1
+    count: int = 1  # type: ignore[assignment]
     """Its elements."""
     unit: str = ""
     """The unit of its elements, such as `rad`."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import time
 from bisect import bisect_left
+from typing import Any
 
 from . import _layout as layout
 from ._bus import Bus, Receiver
@@ -213,7 +214,7 @@ class SignalReader:
             taken += self._take(head, payload)
         return taken
 
-    def _take(self, head: tuple[int, ...], payload: bytes) -> bool:
+    def _take(self, head: tuple[Any, ...], payload: bytes) -> bool:
         """Take in one sample; return whether it was kept."""
         what = f"signal {self.name}"
         if head[:3] != _VERSION:
