@@ -42,8 +42,9 @@ def test_served_depth_is_the_networks(tmp_path: Path, height: int, width: int) -
     onnxruntime = pytest.importorskip("onnxruntime", reason="onnxruntime is not installed (requirements-lab.txt)")
     rng = np.random.default_rng(height)
     y, x = np.mgrid[:height, :width]
-    color = (128 + 90 * np.sin(np.stack([x / 5, y / 7, (x + y) / 9], -1)) + rng.uniform(-5, 5, (height, width, 3))).clip(0, 255)
-    Image.fromarray(color.astype(np.uint8)).save(tmp_path / "color.png")
+    waves = 128 + 90 * np.sin(np.stack([x / 5, y / 7, (x + y) / 9], -1))
+    color = (waves + rng.uniform(-5, 5, waves.shape)).clip(0, 255).astype(np.uint8)
+    Image.fromarray(color).save(tmp_path / "color.png")
     depth = (900 + 3 * x + 400 * (y > height // 2) + rng.normal(0, 5, (height, width))).astype(np.uint16)
     depth[rng.random((height, width)) < 0.2] = 0
     depth[:, : width // 4] = 0
@@ -53,15 +54,14 @@ def test_served_depth_is_the_networks(tmp_path: Path, height: int, width: int) -
     filled = torch.from_numpy(run(tmp_path, "fill", "1"))[None]
     measured = (depth > 0) & (depth < 65535)
     raw = torch.from_numpy(np.where(measured, 1 / (UNIT_M * np.where(measured, depth, 1)), 0).astype(np.float32))[None]
-    planes = torch.from_numpy(color.astype(np.uint8).astype(np.float32) / 255).permute(2, 0, 1)[None]
+    planes = torch.from_numpy(color.astype(np.float32) / 255).permute(2, 0, 1)[None]
     inputs = tiny_inputs(planes, filled, raw)
     bottom, right = -height % MULTIPLE, -width % MULTIPLE
     pad = torch.nn.functional.pad
     inputs = pad(inputs, (0, right, 0, bottom), mode="replicate")
     padded = pad(filled[None], (0, right, 0, bottom), mode="replicate")[0]
-    session = onnxruntime.InferenceSession(
-        str(ROOT / "cdm_plugin/models/tiny.onnx"), providers=["CPUExecutionProvider"]
-    )
+    model = ROOT / "cdm_plugin/models/tiny.onnx"
+    session = onnxruntime.InferenceSession(str(model), providers=["CPUExecutionProvider"])
     (expected,) = session.run(None, {"x": inputs.numpy(), "filled": padded.numpy()})
     expected = expected[0, :height, :width]
 

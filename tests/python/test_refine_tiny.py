@@ -112,9 +112,8 @@ def test_a_rig_publishes_what_tiny_gives(binary: str, runtime: Path, model: str,
         out = tmp_path / f"{engine}.png"
         arguments = ["--rgb", str(tmp_path / "color.png"), "--depth", str(tmp_path / "depth.png")]
         arguments += ["--depth-unit", repr(unit_m), "--out-unit", repr(unit_m), "--engine", engine]
-        report = command(
-            binary, runtime, "cdm", "run", *arguments, "--threads", "1", "--fill-reach", "1", "--out", str(out), "--json"
-        )
+        arguments += ["--threads", "1", "--fill-reach", "1", "--out", str(out), "--json"]
+        report = command(binary, runtime, "cdm", "run", *arguments)
         assert json.loads(report)["warnings"] == []
         return np.asarray(Image.open(out))
 
