@@ -38,7 +38,7 @@ struct Lens {
     coeffs: [f64; 8],
 }
 
-/// What fills the holes of measured depth: the refiner `fill` of the daemon, so that a network learns on what it gets
+/// Makes the refiner `fill` of the daemon, for the holes of measured depth, so that a network learns on what it gets
 /// live. Every hole is filled.
 pub(super) fn fill() -> Result<FillRefiner> {
     let made = FillRefiner::new(1).map(|fill| fill.with_reach(1.0));

@@ -1,6 +1,6 @@
 //! Regions of measured depth hidden at random, so that a network learns to fill holes from context of every kind.
 //!
-//! What a sensor misses has a cause: glass, dark things, what lies behind edges. A network that sees only such holes
+//! Holes of a sensor have a cause: glass, dark things, what lies behind edges. A network that sees only such holes
 //! learns the cause instead of the context. A hidden region is a rectangle, a border, a blob or a thing, of any size.
 
 use super::super::noise::{Rolls, fractal2};
