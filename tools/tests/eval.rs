@@ -337,7 +337,7 @@ fn a_model_gives_the_depth_of_cdm_run() {
     let model = at("made-up.safetensors");
     depthrig_cdm::weights::write_seeded(depthrig_cdm::Encoder::Vits, 1, Path::new(&model)).unwrap();
     for i in 0..2u32 {
-        let raw = |x, y| if roll(i + x / 9, y / 9) % 5 == 0 { 0 } else { 800 + x + y + 20 * i };
+        let raw = |x, y| if roll(i + x / 9, y / 9).is_multiple_of(5) { 0 } else { 800 + x + y + 20 * i };
         image::RgbImage::from_fn(112, 84, |x, y| {
             image::Rgb([(x * 2) as u8, (y * 3) as u8, (x * y % 251) as u8])
         })

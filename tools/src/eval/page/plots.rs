@@ -8,6 +8,9 @@ use depthrig_recorder::report::page::{escape, number};
 use std::collections::BTreeSet;
 use std::fmt::Write;
 
+/// A number of a row's metrics.
+type Pick = fn(&DepthMetrics) -> f64;
+
 fn series(group: &Group<'_>, of: impl Fn(&Row) -> Vec<Option<f64>>) -> Vec<Series> {
     group.rows.iter().map(|r| Series { name: r.info.name.clone(), values: of(r) }).collect()
 }
@@ -21,7 +24,6 @@ pub fn bars_of_rows(out: &mut String, groups: &[Group<'_>]) {
     out.push_str("<section><h2>L1 of each prediction</h2>");
     for group in groups {
         let names: Vec<String> = group.rows.iter().map(|r| r.info.name.clone()).collect();
-        type Pick = fn(&DepthMetrics) -> f64;
         let of = |name: &str, pick: Pick| Series {
             name: name.to_owned(),
             values: group.rows.iter().map(|r| known(pick(&r.metrics.mean_of_images))).collect(),
@@ -40,7 +42,6 @@ pub fn bars_of_rows(out: &mut String, groups: &[Group<'_>]) {
 
 /// Curves over the distance of the reference.
 pub fn by_distance(out: &mut String, groups: &[Group<'_>]) {
-    type Pick = fn(&DepthMetrics) -> f64;
     let forms: [(&str, &str, Pick); 4] = [
         ("L1 by distance", "L1, m", |m| m.l1_m),
         ("Strict L1 by distance", "strict L1, m", |m| m.strict_l1_m),
@@ -80,7 +81,6 @@ pub fn by_material(out: &mut String, groups: &[Group<'_>]) {
         }
         let names: Vec<String> = names.into_iter().map(str::to_owned).collect();
         let _ = write!(out, "<section><h2>Error by material{}</h2>", escape(&group.of()));
-        type Pick = fn(&DepthMetrics) -> f64;
         let forms: [(&str, Pick); 2] =
             [("strict L1, m", |m| m.strict_l1_m), ("missing, %", |m| m.missing_percent)];
         for (axis, pick) in forms {

@@ -44,7 +44,9 @@ fn blur(color: &mut [u8], w: usize, sigma: f32) {
     let mut kernel: Vec<f32> =
         (0..=2 * reach).map(|i| (-0.5 * ((i as f32 - reach as f32) / sigma).powi(2)).exp()).collect();
     let sum: f32 = kernel.iter().sum();
-    kernel.iter_mut().for_each(|k| *k /= sum);
+    for k in &mut kernel {
+        *k /= sum;
+    }
     let h = color.len() / 3 / w;
     let mut rows = vec![0.0f32; color.len()];
     for y in 0..h {
@@ -85,14 +87,14 @@ fn compress(color: &mut [u8], w: usize, quality: f32) {
     let scale = if quality < 50.0 { 50.0 / quality } else { 2.0 - quality / 50.0 };
     let tables = [LUMA, CHROMA].map(|t| t.map(|v| (f32::from(v) * scale).round().clamp(1.0, 255.0)));
     for (y, x) in (0..h / N).flat_map(|y| (0..w / N).map(move |x| (y * N, x * N))) {
-        let mut planes = [[0.0f32; N * N]; 3];
-        for i in 0..N * N {
-            let at = ((y + i / N) * w + x + i % N) * 3;
-            let [r, g, b] = [0, 1, 2].map(|c| f32::from(color[at + c]));
-            planes[0][i] = 0.299 * r + 0.587 * g + 0.114 * b - 128.0;
-            planes[1][i] = -0.168_736 * r - 0.331_264 * g + 0.5 * b;
-            planes[2][i] = 0.5 * r - 0.418_688 * g - 0.081_312 * b;
-        }
+        let at = |i: usize| ((y + i / N) * w + x + i % N) * 3;
+        let pixels: [[f32; 3]; N * N] =
+            core::array::from_fn(|i| [0, 1, 2].map(|c| f32::from(color[at(i) + c])));
+        let mut planes = [
+            pixels.map(|[r, g, b]| 0.299 * r + 0.587 * g + 0.114 * b - 128.0),
+            pixels.map(|[r, g, b]| -0.168_736 * r - 0.331_264 * g + 0.5 * b),
+            pixels.map(|[r, g, b]| 0.5 * r - 0.418_688 * g - 0.081_312 * b),
+        ];
         for (plane, table) in planes.iter_mut().zip([&tables[0], &tables[1], &tables[1]]) {
             *plane = transform(&basis, plane);
             for (v, q) in plane.iter_mut().zip(table) {
@@ -100,12 +102,12 @@ fn compress(color: &mut [u8], w: usize, quality: f32) {
             }
             *plane = transform(&turned(&basis), plane);
         }
-        for i in 0..N * N {
-            let at = ((y + i / N) * w + x + i % N) * 3;
-            let [l, cb, cr] = [planes[0][i] + 128.0, planes[1][i], planes[2][i]];
+        let [luma, blue, red] = planes;
+        for (i, ((l, cb), cr)) in luma.into_iter().zip(blue).zip(red).enumerate() {
+            let l = l + 128.0;
             let rgb = [l + 1.402 * cr, l - 0.344_136 * cb - 0.714_136 * cr, l + 1.772 * cb];
             for (c, v) in rgb.into_iter().enumerate() {
-                color[at + c] = v.round().clamp(0.0, 255.0) as u8;
+                color[at(i) + c] = v.round().clamp(0.0, 255.0) as u8;
             }
         }
     }
