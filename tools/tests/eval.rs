@@ -273,8 +273,8 @@ fn a_recording_with_truth_is_compared_in_one_view() {
     let home = Home::new();
     let cache = home.path().join("cache").display().to_string();
     let text = |truth: bool| {
-        let truths =
-            "[[camera.stream]]\nname = \"depth_true\"\n[[camera.stream]]\nname = \"depth_true_color\"\n";
+        let truths = "[[camera.stream]]\nname = \"depth_true\"\nwidth = 160\nheight = 120\n\
+             [[camera.stream]]\nname = \"depth_true_color\"\nwidth = 160\nheight = 120\n";
         let more = if truth { truths } else { "" };
         format!(
             "rig = \"sim\"\n[recording]\nreserve_mb = 16\n\n[[camera]]\nname = \"cam\"\nbackend = \"synthetic\"\n\

@@ -223,9 +223,14 @@ impl Shared {
         );
         if self.refining && !same {
             bail!(
-                "{}: refiners need the truth in the view of colour; {} is in another one: use --truth {}",
+                "{}: refiners need the truth in the view of colour, {}x{}; {} is in another one or of another size ({}x{}): use --truth {} \
+                 of that size",
                 a.camera(),
+                a.width,
+                a.height,
                 b.stream(),
+                b.width,
+                b.height,
                 TRUTHS[0]
             );
         }
