@@ -11,7 +11,7 @@
 use crate::fill::check;
 use crate::network::ImageNetwork;
 use crate::onnxruntime::TinyNetwork;
-use crate::{Description, FillRefiner, Job, Refiner, RefinerOptions, Result, StepTimes};
+use crate::{Description, Error, ErrorKind, FillRefiner, Job, Refiner, RefinerOptions, Result, StepTimes};
 use depthrig_bus::HostTime;
 
 mod model;
@@ -37,7 +37,13 @@ impl TinyRefiner {
     /// than `cpu` or another precision than `fp32`, and those of the library.
     pub fn open(options: &RefinerOptions) -> Result<Self> {
         let bytes = options.tiny.as_ref().map_or(model::BYTES, |own| &own.bytes);
-        let network = TinyNetwork::open(bytes, options)?;
+        let network = TinyNetwork::open(bytes, options).map_err(|e| match (&options.tiny, e.kind()) {
+            (Some(own), ErrorKind::Engine) => {
+                let what = format!("{}: not a network of the form of tiny: {e}", own.id);
+                Error::new(ErrorKind::BadModel, what).with_source(e)
+            }
+            _ => e,
+        })?;
         let engine = network.describe().to_owned();
         Self::new(Box::new(network), engine, options)
     }
