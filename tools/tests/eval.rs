@@ -383,4 +383,20 @@ fn a_model_gives_the_depth_of_cdm_run() {
     assert!(net["mean_of_images"]["l1_m"].as_f64().unwrap() > 0.001, "{net}");
     assert!(net["engine"].as_str().unwrap().starts_with("onnxruntime"), "{net}");
     assert!(net["model"].as_str().unwrap().starts_with("untrained-"), "{net}");
+
+    // A network of the form of `tiny` from a file: here the one of the program, whose numbers are the same.
+    let own = at("my-tiny.onnx");
+    let shipped = concat!(env!("CARGO_MANIFEST_DIR"), "/../cdm_plugin/models/tiny.onnx");
+    std::fs::copy(shipped, &own).unwrap();
+    let of_file = format!("mine={own}");
+    let got: Value = serde_json::from_str(&eval(&["--refine", "tiny", "--refine", &of_file]).good()).unwrap();
+    let [built_in, mine] = [1, 2].map(|i| got["rows"][i].clone());
+    assert_eq!(built_in["mean_of_images"], mine["mean_of_images"]);
+    assert!(built_in["model"].as_str().unwrap().starts_with("tiny@"), "{built_in}");
+    assert!(mine["model"].as_str().unwrap().starts_with("my-tiny@"), "{mine}");
+    std::fs::write(&own, "no network").unwrap();
+    for (text, part) in [(of_file.as_str(), "my-tiny@"), ("gone=gone.onnx", "gone.onnx: cannot be read")] {
+        let refused = eval(&["--refine", text]);
+        assert!(refused.code != 0 && refused.err.contains(part), "{}", refused.err);
+    }
 }

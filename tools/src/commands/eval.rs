@@ -30,9 +30,10 @@ INPUT is a depthrig dataset with ground truth, a folder in the layout of the HAM
 scenes`. Without it, --truth names a folder of references, and --raw and each --pred folders with the same file paths
 except for the extension (.png and .tiff: 16 bits; .tiff and .npy: metres).
 
---refine runs an engine (fill), an installed model or a checkpoint on raw depth; `filled` is raw depth with its holes
-filled, and NAME:filled a refiner that gets such depth. Plain metrics use the pixels where both have depth. Strict
-metrics use all pixels with a valid reference and count missing depth as 0 m. docs/evaluation.md has the definitions.
+--refine runs an engine (fill), an installed model, a checkpoint or a tiny.onnx on raw depth; `filled` is raw depth
+with its holes filled, and NAME:filled a refiner that gets such depth. Plain metrics use the pixels where both have
+depth. Strict metrics use all pixels with a valid reference and count missing depth as 0 m. docs/evaluation.md has the
+definitions.
 
 Exit codes: 0 compared, 1 nothing could be compared, 2 wrong usage, 3 some images could not be compared.
 

@@ -6,12 +6,13 @@ use super::{Loaded, Source};
 use crate::commands::cdm::store::usage;
 use crate::exit::UsageError;
 use anyhow::{Context, Result, bail};
+use depthrig_cdm::tiny::{TinyFile, is_tiny_file};
 use depthrig_cdm::{
     Color, ColorFormat, EngineKind, ErrorKind, Job, ModelStore, Output, Precision, RawDepth, Refiner,
     RefinerOptions, StepTimes,
 };
 use serde::{Deserialize, Serialize};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Raw depth with each hole filled by the nearest measured depth, as a row of its own.
 pub const FILLED: &str = "filled";
@@ -199,8 +200,11 @@ impl Row {
         }
         let engine = choice.what.parse::<EngineKind>();
         let store = || ModelStore::open(options.models.as_deref());
+        let file = Path::new(&choice.what);
+        let tiny = is_tiny_file(file).then(|| TinyFile::read(file)).transpose()?;
         let model = match &engine {
             Ok(_) => None,
+            Err(_) if tiny.is_some() => None,
             Err(unknown) => Some(store().and_then(|s| s.model(&choice.what)).map_err(|e| {
                 // A name may have been meant as either.
                 let said = if e.kind() == ErrorKind::NotFound {
@@ -212,8 +216,9 @@ impl Row {
             })?),
         };
         let refiner = depthrig_cdm::refiner(&RefinerOptions {
-            engine: engine.ok(),
+            engine: engine.ok().or_else(|| tiny.is_some().then_some(EngineKind::Tiny)),
             model,
+            tiny,
             input_size: options.input_size,
             precision: options.precision,
             device: options.device.clone(),

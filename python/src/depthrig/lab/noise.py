@@ -68,11 +68,12 @@ def plane_residuals(disparity: npt.NDArray[np.float64]) -> npt.NDArray[np.float6
     x, y = np.meshgrid(offsets, offsets)
     basis = np.stack([x.ravel(), y.ravel(), np.ones(SIDE * SIDE)], 1)
     rows, columns = disparity.shape[0] // SIDE, disparity.shape[1] // SIDE
-    tiles = disparity[: rows * SIDE, : columns * SIDE].reshape(rows, SIDE, columns, SIDE).swapaxes(1, 2)
-    tiles = tiles.reshape(-1, SIDE * SIDE)
+    cut = disparity[: rows * SIDE, : columns * SIDE].reshape(rows, SIDE, columns, SIDE)
+    tiles: npt.NDArray[np.float64] = cut.swapaxes(1, 2).reshape(-1, SIDE * SIDE)
     tiles = tiles[np.isfinite(tiles).all(1)]
-    planes = tiles @ np.linalg.pinv(basis).T
-    return (tiles - planes @ basis.T).reshape(-1, SIDE, SIDE)
+    of_plane: npt.NDArray[np.float64] = np.linalg.pinv(basis).astype(np.float64).T
+    residuals: npt.NDArray[np.float64] = tiles - tiles @ of_plane @ basis.T
+    return residuals.reshape(-1, SIDE, SIDE)
 
 
 def measure(raws: Iterable[tuple[npt.NDArray[np.float32], float]]) -> Noise:
