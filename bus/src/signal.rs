@@ -70,7 +70,7 @@ pub const MAX_HELD: usize = 2;
 pub const MAX_PUBLISHERS: usize = 4;
 /// Processes that may have the channel open.
 pub const MAX_NODES: usize = 16;
-/// How far a sample's time may lie ahead of the clock: more is a time of another clock.
+/// The most that a sample's time may lie ahead of the clock: more is a time of another clock.
 pub const MAX_AHEAD: Duration = Duration::from_millis(100);
 /// Slots of a channel. All unread samples are among the last [`BUFFER`], whoever reads them; besides these there are the
 /// ones that subscribers hold, the one for late joiners, the one that is written, and some to spare.

@@ -1,21 +1,23 @@
 //! Signals between real processes: slow, killed, second and foreign ones.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
+#[path = "support/helper.rs"]
+mod helper;
+
 use depthrig_bus::signal::{self, MAX_AHEAD, SLOTS};
 use depthrig_bus::{
     ErrorKind, FieldType, HostTime, RuntimeDir, SHM_PREFIX, Series, SignalDescription, SignalField,
     SignalFlags, SignalHeader, SignalName, SignalPublisher, SignalSample, Signals, Stamp, Value, shm,
 };
+use helper::{DIR, Helper, ROLE};
 use iceoryx2::prelude::*;
 use proptest::prelude::*;
-use std::io::{BufRead, BufReader, Write};
-use std::process::{Child, Command, Stdio};
+use std::io::Write;
+use std::process::Command;
 use std::sync::Arc;
 use std::time::Duration;
 
 const WAIT: Duration = Duration::from_secs(40);
-const ROLE: &str = "DEPTHRIG_BUS_TEST_ROLE";
-const DIR: &str = "DEPTHRIG_BUS_TEST_DIR";
 
 struct Fixture {
     dir: tempfile::TempDir,
@@ -65,48 +67,6 @@ fn helper_process() {
     }
     loop {
         std::thread::park();
-    }
-}
-
-/// The helper process in `role`; killed when the test ends, whatever its end.
-struct Helper(Child, BufReader<std::process::ChildStdout>);
-
-impl Helper {
-    fn start(f: &Fixture, role: &str) -> Self {
-        let mut child = Command::new(std::env::current_exe().unwrap())
-            .args(["--exact", "helper_process", "--nocapture"])
-            .env(ROLE, role)
-            .env(DIR, f.dir.path())
-            .stdout(Stdio::piped())
-            .spawn()
-            .unwrap();
-        let out = BufReader::new(child.stdout.take().unwrap());
-        let mut helper = Self(child, out);
-        helper.wait_for("ready");
-        helper
-    }
-
-    fn wait_for(&mut self, word: &str) {
-        let mut line = String::new();
-        while self.1.read_line(&mut line).unwrap() > 0 {
-            if line.contains(word) {
-                return;
-            }
-            line.clear();
-        }
-        panic!("the helper process ended before it said \"{word}\"");
-    }
-
-    fn kill(mut self) {
-        self.0.kill().unwrap();
-        self.0.wait().unwrap();
-    }
-}
-
-impl Drop for Helper {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
     }
 }
 
@@ -281,7 +241,7 @@ fn a_killed_publisher_is_followed_by_another_and_nothing_else_notices() {
     // More often than the channel has places for publishers.
     let rounds = signal::MAX_PUBLISHERS as u64 + 2;
     for round in 0..rounds {
-        let publisher = Helper::start(&f, "publisher");
+        let publisher = Helper::start(f.dir.path(), "publisher");
         let subscriber = subscriber.get_or_insert_with(|| f.signals.subscriber(arm().name()).unwrap());
         let mut read = 0;
         while read < 3 {
@@ -324,7 +284,7 @@ fn killed_readers_give_their_places_back_and_cost_nobody_a_sample() {
     let mut sent = 0;
     for round in 0..signal::MAX_SUBSCRIBERS + 3 {
         // Every other one never reads, so that all that the channel keeps waits for it.
-        let mut reader = Helper::start(&f, if round % 2 == 0 { "reader" } else { "sleeper" });
+        let mut reader = Helper::start(f.dir.path(), if round % 2 == 0 { "reader" } else { "sleeper" });
         for _ in 0..300 {
             sent = publish(&mut publisher);
             taken += series.fill(&mut steady).unwrap();

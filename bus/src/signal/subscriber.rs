@@ -89,7 +89,7 @@ impl SignalSubscriber {
         self.missed
     }
 
-    /// How often another publisher took over.
+    /// Number of times that another publisher took over.
     pub const fn restarts(&self) -> u64 {
         self.restarts
     }

@@ -161,7 +161,8 @@ mod tests {
 
     #[test]
     fn blur_keeps_the_mean_and_spreads_a_dot_as_a_gaussian_does() {
-        let (w, h) = (41, 41);
+        let w = 41;
+        let h = 41;
         let mut color = vec![0; w * h * 3];
         color[(20 * w + 20) * 3] = 255;
         blur(&mut color, w, 1.0);
