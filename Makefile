@@ -24,7 +24,7 @@ ROBOTS := .venv-robots
 DOCS := .venv-docs
 REQUIREMENTS := python/requirements-test.txt tests/python/requirements-s3.txt $(READERS)/requirements.txt tests/page_browser/requirements.txt tests/terminal/requirements.txt
 
-.PHONY: help demo demo-calibration environments test check-debian13 test-long vm fuzz lint docs dist test-dist bench bench-page bench-peers bench-feed clean setup-build setup-test setup-vm setup-peers setup-fuzz setup-dist
+.PHONY: help demo demo-calibration lab-demo train-tiny environments test check-debian13 test-long vm fuzz lint docs dist test-dist bench bench-page bench-peers bench-feed clean setup-build setup-test setup-vm setup-peers setup-fuzz setup-dist
 
 help: ## show this list
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -69,6 +69,12 @@ lint: ## formatting and lints, as CI runs them
 	tools/words.py
 	tools/docs/build.py check
 	@if command -v cargo-deny >/dev/null; then cargo deny check; else echo "cargo-deny is not installed: licences not checked"; fi
+
+lab-demo: setup-build $(LEROBOT)/.stamp ## the depth lab in a quarter of an hour: makes scenes, trains a very small network, evaluates it, serves it live
+	tools/lab-demo.sh $(ARGS)
+
+train-tiny: setup-build $(LEROBOT)/.stamp ## the refiner `tiny`: makes its data, trains, measures, writes cdm_plugin/models/tiny.{onnx,toml}
+	tools/train-tiny.sh
 
 docs: setup-build $(DOCS)/.stamp ## the site of the documents and the generated reference, in target/book
 	cargo build --workspace --bins --quiet

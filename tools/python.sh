@@ -5,6 +5,7 @@
 #   tools/python.sh versions   types, then the wheel's tests on every Python from 3.9 on that this computer has
 #   tools/python.sh torch      the tests that need PyTorch, with that of .venv-lerobot; 77 when it is not there
 #   tools/python.sh lab        the tests of depthrig.lab, with the same PyTorch; 77 when it is not there
+#   tools/python.sh run-lab MODULE ARGUMENT...   a module of depthrig.lab, such as depthrig.lab.train, with the same
 #   tools/python.sh oak        the OAK bridge with the vendor's SDK in .venv-oak: tests, and types against its stubs; 77
 #                              when it is not there
 #
@@ -101,9 +102,9 @@ print("==", sys.version.split()[0], "from", folder.relative_to(sys.prefix))' &&
             --rootdir "$root/python" -p no:cacheprovider "$root/python/tests"
 }
 
-with_torch() { # NAME TEST...: tests with the PyTorch of .venv-lerobot and python/requirements-NAME.txt
+# Makes the folder of python/requirements-NAME.txt beside the PyTorch of .venv-lerobot.
+beside() { # NAME
     local name=$1 python=$PWD/.venv-lerobot/bin/python
-    shift
     if ! "$python" -c 'import torch' 2>/dev/null; then
         echo "PyTorch is not in .venv-lerobot; make test puts it there"
         return 77
@@ -116,7 +117,14 @@ with_torch() { # NAME TEST...: tests with the PyTorch of .venv-lerobot and pytho
         "${pip[@]}" --python "$python" install --quiet --no-deps --target "$beside" --requirement "$requirements"
         touch "$beside/.stamp"
     fi
-    PYTHONPATH=$PWD/python/src:$beside box "$python" -m pytest --quiet -p no:cacheprovider "$@"
+}
+
+with_torch() { # NAME TEST...: tests with the PyTorch of .venv-lerobot and python/requirements-NAME.txt
+    local name=$1
+    shift
+    beside "$name" || return
+    PYTHONPATH=$PWD/python/src:$envs/beside-$name box "$PWD/.venv-lerobot/bin/python" -m pytest --quiet \
+        -p no:cacheprovider "$@"
 }
 
 torch() { with_torch torch python/tests/test_torch.py python/tests/test_policy.py; }
@@ -128,6 +136,12 @@ lab() {
         return 77
     fi
     OMP_NUM_THREADS=1 with_torch lab tests/lab
+}
+
+# One thread: sums have one order, so that a run has the same bits wherever it is interrupted.
+run-lab() { # MODULE ARGUMENT...
+    beside lab
+    OMP_NUM_THREADS=1 PYTHONPATH=$PWD/python/src:$envs/beside-lab .venv-lerobot/bin/python -m "$@"
 }
 
 oak() {
@@ -145,8 +159,9 @@ oak() {
 
 case ${1:-} in
 environments | versions | torch | lab | oak) "$1" ;;
+run-lab) "$@" ;;
 *)
-    sed -n '2,12s/^# \{0,1\}//p' "$0" >&2
+    sed -n '2,13s/^# \{0,1\}//p' "$0" >&2
     exit 2
     ;;
 esac

@@ -67,6 +67,8 @@ pub struct Form {
     pub listeners: usize,
     /// Loans of one publisher at a time.
     pub loans: usize,
+    /// Slots without which it is not opened when memory is short.
+    pub fewest_slots: usize,
 }
 
 /// The channels of a rig.
@@ -81,6 +83,7 @@ pub const RIG: Form = Form {
     notifiers: MAX_PUBLISHERS,
     listeners: PLACES,
     loans: MAX_LOANS,
+    fewest_slots: shm::MIN_SLOTS,
 };
 
 /// A header type that can be sent over a channel.
@@ -119,7 +122,7 @@ impl<H: Header> Channel<H> {
     }
 
     /// The writing end without the event, with memory behind every slot: `slots` of them, or as many as still fit into
-    /// shared memory if that is at least [`shm::MIN_SLOTS`].
+    /// shared memory if these are at least [`Form::fewest_slots`].
     pub fn outlet(&self, node: &Node<IoxService>, max_bytes: usize, slots: usize) -> Result<Outlet<H>> {
         let service = self.service(node, true)?;
         let max_bytes = max_bytes.max(1);
@@ -133,7 +136,7 @@ impl<H: Header> Channel<H> {
             // Its memory is free again before the next one is tried.
             drop(port);
             let fewer = lack.slots_that_fit()?;
-            if fewer < shm::MIN_SLOTS.min(slots) || fewer >= slots {
+            if fewer < self.form.fewest_slots.min(slots) || fewer >= slots {
                 return Err(lack.refusal(&self.what, fewer));
             }
             tracing::warn!(

@@ -18,6 +18,14 @@ pub enum ErrorKind {
     PermissionDenied,
     /// A limit of the channel was reached (subscribers, held samples, sample size).
     LimitReached,
+    /// Values, a time or a description break a rule of signals.
+    Invalid,
+    /// A signal's publisher was followed by one with other fields.
+    Changed,
+    /// Two samples of a signal are further apart than the caller allows.
+    Gap,
+    /// A time is not between two samples of a signal.
+    Outside,
     /// The other side refuses, and says why.
     Refused,
     /// The operating system or iceoryx2 refused for another reason.

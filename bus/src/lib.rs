@@ -1,6 +1,7 @@
 //! The frame bus: the vocabulary of depthrig and its channels in shared memory.
 //! The lowest layer: every other crate uses its types; it depends on no camera, file or model. Start at [`FrameHeader`]
-//! (describes a frame), [`Bus`] (open a rig), [`Publisher`] and [`Subscriber`] (write and read a channel).
+//! (describes a frame), [`Bus`] (open a rig), [`Publisher`] and [`Subscriber`] (write and read a channel); at [`Signals`] for
+//! samples of a robot.
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
 
 mod channel;
@@ -21,6 +22,7 @@ mod publisher;
 pub mod runtime;
 mod sets;
 pub mod shm;
+pub mod signal;
 mod subscriber;
 pub mod sync;
 mod text;
@@ -44,4 +46,8 @@ pub use publisher::{FrameMut, Publisher};
 pub use runtime::RuntimeDir;
 pub use sets::{MemberRecord, RECORD_BYTES, SetFrame, SetHeader, SetPublisher, SetSubscriber};
 pub use shm::SHM_PREFIX;
+pub use signal::{
+    FieldType, Series, SignalDescription, SignalField, SignalFlags, SignalHeader, SignalKind, SignalName,
+    SignalPublisher, SignalSample, SignalSubscriber, Signals, Stamp, Value,
+};
 pub use subscriber::{Frame, Subscriber};

@@ -32,26 +32,7 @@ impl Bus {
     /// [`ErrorKind::PermissionDenied`] when the folder is another user's, [`ErrorKind::Other`] when iceoryx2
     /// cannot make its files.
     pub fn open(runtime: &RuntimeDir, rig: &RigName) -> Result<Self> {
-        // iceoryx2 writes its own log to stderr; its errors come back as errors and are logged once, by us.
-        set_log_level(LogLevel::Fatal);
-        let config = config(runtime)?;
-        shm::check_room()?;
-        let node = NodeBuilder::new()
-            .signal_handling_mode(SignalHandlingMode::Disabled) // signals belong to the process, not to a library
-            .config(&config)
-            .create::<IoxService>()
-            .map_err(|e| {
-                let path = runtime.path().display();
-                let kind = match e {
-                    iceoryx2::node::NodeCreationFailure::InsufficientPermissions => {
-                        ErrorKind::PermissionDenied
-                    }
-                    _ => ErrorKind::Other,
-                };
-                let why = limits::descriptors().map_or_else(String::new, |why| format!(": {why}"));
-                Error::new(kind, format!("the bus of rig \"{rig}\" could not be joined in {path}{why}"))
-                    .with_source(e)
-            })?;
+        let node = join(runtime)?;
         Ok(Self { node, rig: rig.clone(), runtime: runtime.clone(), starved: Arc::default() })
     }
 
@@ -158,30 +139,7 @@ impl Bus {
     /// Frees what killed processes left behind; the daemon calls this once a second. Returns how many dead
     /// processes were cleaned up.
     pub fn clean_dead(&self) -> u64 {
-        let config = self.node.config();
-        let mut cleaned = 0;
-        let listed = Node::<IoxService>::list(config, |state| {
-            if let NodeState::Dead(dead) = state {
-                // One that was killed while it was being removed has lost its own description. iceoryx2 would then look
-                // for it below its default folder, find nothing, and call that cleaned up, again and again.
-                let removed = match dead.details() {
-                    Some(_) => dead.try_remove_stale_resources(),
-                    None => DeadNodeView::<IoxService>::__internal_try_remove_stale_resources(
-                        *dead.id(),
-                        NodeDetails::__internal_new(&None, config),
-                    ),
-                };
-                match removed {
-                    Ok(()) => cleaned += 1,
-                    Err(e) => tracing::debug!(error = ?e, "a dead process cannot be cleaned up yet"),
-                }
-            }
-            CallbackProgression::Continue
-        });
-        if let Err(e) = listed {
-            tracing::debug!(error = ?e, "dead processes cannot be looked for");
-        }
-        cleaned
+        clean_dead(&self.node)
     }
 
     /// Whether a publisher found no free slot since the last call: a dead subscriber may hold them.
@@ -229,6 +187,57 @@ impl Bus {
         };
         Error::new(ErrorKind::NotFound, format!("{e}; {hint}"))
     }
+}
+
+/// Joins the bus below `runtime`. It creates no channel.
+///
+/// # Errors
+/// As [`Bus::open`].
+pub(crate) fn join(runtime: &RuntimeDir) -> Result<Node<IoxService>> {
+    // iceoryx2 writes its own log to stderr; its errors come back as errors and are logged once, by us.
+    set_log_level(LogLevel::Fatal);
+    let config = config(runtime)?;
+    shm::check_room()?;
+    let builder = NodeBuilder::new()
+        .signal_handling_mode(SignalHandlingMode::Disabled) // signals belong to the process, not to a library
+        .config(&config);
+    builder.create::<IoxService>().map_err(|e| {
+        let path = runtime.path().display();
+        let kind = match e {
+            iceoryx2::node::NodeCreationFailure::InsufficientPermissions => ErrorKind::PermissionDenied,
+            _ => ErrorKind::Other,
+        };
+        let why = limits::descriptors().map_or_else(String::new, |why| format!(": {why}"));
+        Error::new(kind, format!("the bus in {path} could not be joined{why}")).with_source(e)
+    })
+}
+
+/// Frees what killed processes left behind; returns how many of them were cleaned up.
+pub(crate) fn clean_dead(node: &Node<IoxService>) -> u64 {
+    let config = node.config();
+    let mut cleaned = 0;
+    let listed = Node::<IoxService>::list(config, |state| {
+        if let NodeState::Dead(dead) = state {
+            // One that was killed while it was being removed has lost its own description. iceoryx2 would then look
+            // for it below its default folder, find nothing, and call that cleaned up, again and again.
+            let removed = match dead.details() {
+                Some(_) => dead.try_remove_stale_resources(),
+                None => DeadNodeView::<IoxService>::__internal_try_remove_stale_resources(
+                    *dead.id(),
+                    NodeDetails::__internal_new(&None, config),
+                ),
+            };
+            match removed {
+                Ok(()) => cleaned += 1,
+                Err(e) => tracing::debug!(error = ?e, "a dead process cannot be cleaned up yet"),
+            }
+        }
+        CallbackProgression::Continue
+    });
+    if let Err(e) = listed {
+        tracing::debug!(error = ?e, "dead processes cannot be looked for");
+    }
+    cleaned
 }
 
 /// The configuration that every process of a user's rigs shares. It is set in code, because iceoryx2 would

@@ -1,17 +1,19 @@
 //! The bus between real processes: slow, holding, killed and foreign ones.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
+#[path = "support/helper.rs"]
+mod helper;
+
 use depthrig_bus::{
     Bus, ErrorKind, Frame, HostTime, MemberRecord, PixelFormat, Publisher, RigName, RuntimeDir, SHM_PREFIX,
     SetHeader, StreamId, shm,
 };
+use helper::{DIR, Helper, ROLE};
 use iceoryx2::prelude::*;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use std::collections::BTreeSet;
-use std::io::{BufRead, BufReader};
 use std::os::unix::fs::MetadataExt;
 use std::path::PathBuf;
-use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
 const LEN: usize = 64 * 48 * 2;
@@ -226,8 +228,8 @@ fn clean(bus: &Bus) {
 /// Not a test by itself: the other process of the tests below, this same binary started again.
 #[test]
 fn helper_process() {
-    let Ok(role) = std::env::var("DEPTHRIG_BUS_TEST_ROLE") else { return };
-    let dir = std::env::var("DEPTHRIG_BUS_TEST_DIR").unwrap();
+    let Ok(role) = std::env::var(ROLE) else { return };
+    let dir = std::env::var(DIR).unwrap();
     let bus = Bus::open(&RuntimeDir::at(dir.as_ref()).unwrap(), &rig()).unwrap();
     let id = StreamId::new("cam", "depth").unwrap();
     if role == "out of descriptors" {
@@ -261,52 +263,10 @@ fn helper_process() {
     }
 }
 
-/// The helper process in `role`; killed when the test ends, whatever its end.
-struct Helper(Child, BufReader<std::process::ChildStdout>);
-
-impl Helper {
-    fn start(f: &Fixture, role: &str) -> Self {
-        let mut child = Command::new(std::env::current_exe().unwrap())
-            .args(["--exact", "helper_process", "--nocapture"])
-            .env("DEPTHRIG_BUS_TEST_ROLE", role)
-            .env("DEPTHRIG_BUS_TEST_DIR", f.dir.path())
-            .stdout(Stdio::piped())
-            .spawn()
-            .unwrap();
-        let out = BufReader::new(child.stdout.take().unwrap());
-        let mut helper = Self(child, out);
-        helper.wait_for("ready");
-        helper
-    }
-
-    fn wait_for(&mut self, word: &str) -> String {
-        let mut line = String::new();
-        while self.1.read_line(&mut line).unwrap() > 0 {
-            if line.contains(word) {
-                return line;
-            }
-            line.clear();
-        }
-        panic!("the helper process ended before it said \"{word}\"");
-    }
-
-    fn kill(mut self) {
-        self.0.kill().unwrap();
-        self.0.wait().unwrap();
-    }
-}
-
-impl Drop for Helper {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
-
 #[test]
 fn a_killed_publisher_is_noticed_and_its_successor_is_heard() {
     let f = fixture();
-    let first = Helper::start(&f, "publisher");
+    let first = Helper::start(f.dir.path(), "publisher");
     let mut subscriber = f.bus.subscriber_within(&f.id, WAIT).unwrap();
     subscriber.next_timeout(WAIT).unwrap().unwrap();
     first.kill();
@@ -314,7 +274,7 @@ fn a_killed_publisher_is_noticed_and_its_successor_is_heard() {
     clean(&f.bus);
     assert!(!subscriber.is_live());
     assert_eq!(subscriber.next().unwrap_err().kind(), ErrorKind::NotFound);
-    let _second = Helper::start(&f, "publisher");
+    let _second = Helper::start(f.dir.path(), "publisher");
     assert_eq!(whole(&subscriber.next_timeout(WAIT).unwrap().expect("the successor's frame")) % 256, {
         let next = subscriber.next_timeout(WAIT).unwrap().unwrap();
         (next.header().sequence - 1) % 256
@@ -326,7 +286,7 @@ fn a_killed_subscriber_gives_its_slots_back() {
     let f = fixture();
     let publisher = f.bus.publisher(&f.id, LEN, 8).unwrap();
     for round in 0..4u64 {
-        let mut reader = Helper::start(&f, "subscriber");
+        let mut reader = Helper::start(f.dir.path(), "subscriber");
         let mut sequence = round * 100;
         let stop = std::thread::scope(|s| {
             let waiting = s.spawn(|| drop(reader.wait_for("holding")));
@@ -358,7 +318,7 @@ fn a_dead_process_whose_description_is_gone_is_removed_and_counted_once() {
         entries.filter(|path| path.is_dir()).collect()
     };
     let own = folders();
-    let reader = Helper::start(&f, "subscriber");
+    let reader = Helper::start(f.dir.path(), "subscriber");
     let dead: Vec<_> = folders().into_iter().filter(|folder| !own.contains(folder)).collect();
     assert_eq!(dead.len(), 1);
     reader.kill();
@@ -394,7 +354,7 @@ fn sixteen_subscribers_find_room_beside_the_daemons_own() {
 fn a_process_without_descriptors_is_told_so() {
     let f = fixture();
     let _publisher = f.bus.publisher(&f.id, LEN, 16).unwrap();
-    let said = Helper::start(&f, "out of descriptors").wait_for("refused");
+    let said = Helper::start(f.dir.path(), "out of descriptors").wait_for("refused");
     assert!(said.contains("file descriptors open") && said.contains("ulimit -n"), "{said}");
 }
 

@@ -9,10 +9,11 @@ use depthrig_bus::external::{
     ExternalModeFlags, ExternalOffer, ExternalReason, ExternalState, ExternalWant, FRAME_FIELDS, MODE_FIELDS,
     OFFER_FIELDS,
 };
+use depthrig_bus::signal;
 use depthrig_bus::{
     ClockDomain, Distortion, DropReason, FIELDS, Field, FrameFlags, FrameHeader, HEADER_SIZE, HEADER_VERSION,
     IOX_FOLDER, MOTION_FIELDS, MOTION_SAMPLE_BYTES, MotionFlags, PixelFormat, RECORD_BYTES, SCHEMA,
-    SHM_PREFIX, SetHeader, StageStep, runtime::RUNTIME_DIR_VARIABLE,
+    SHM_PREFIX, SetHeader, SignalFlags, SignalHeader, StageStep, runtime::RUNTIME_DIR_VARIABLE,
 };
 use iceoryx2::prelude::ZeroCopySend;
 use std::path::Path;
@@ -72,6 +73,7 @@ fn mirror() -> String {
     table(&mut out, "EXTERNAL_MODE_FIELDS", MODE_FIELDS);
     table(&mut out, "EXTERNAL_ANSWER_FIELDS", ANSWER_FIELDS);
     table(&mut out, "EXTERNAL_FRAME_FIELDS", FRAME_FIELDS);
+    table(&mut out, "SIGNAL_FIELDS", signal::SIGNAL_FIELDS);
     nested(&mut out, "intrinsics", "IntrinsicsFields", "Intrinsics", GEOMETRY_SOURCE);
     nested(&mut out, "pose", "PoseFields", "Pose", GEOMETRY_SOURCE);
     class(&mut out, "HeaderFields", "FrameHeader", HEADER_SOURCE, FIELDS);
@@ -118,6 +120,39 @@ fn constants(out: &mut String) {
     for (name, value) in external_constants() {
         out.push_str(&format!("EXTERNAL_{name} = {value}\n"));
     }
+    out.push_str("\n# Signals: docs/demonstrations.md\n");
+    for (name, value) in signal_constants() {
+        out.push_str(&format!("SIGNAL_{name} = {value}\n"));
+    }
+}
+
+fn signal_constants() -> Vec<(&'static str, String)> {
+    // SAFETY: as in `constants`.
+    let header_type = unsafe { <SignalHeader as ZeroCopySend>::type_name() };
+    let types = signal::FieldType::ALL.map(|t| format!("{:?}: {}", t.name(), t.bytes())).join(", ");
+    let kinds = signal::SignalKind::ALL.map(|k| format!("{:?}", k.name())).join(", ");
+    vec![
+        ("VERSION", signal::SIGNAL_VERSION.to_string()),
+        ("SCHEMA", format!("{:?}", signal::SCHEMA)),
+        ("PREFIX", format!("{:?}", signal::PREFIX)),
+        ("LOCK_SUFFIX", format!("{:?}", signal::LOCK_SUFFIX)),
+        ("HEADER_TYPE", format!("{header_type:?}")),
+        ("HEADER_SIZE", signal::SIGNAL_HEADER_SIZE.to_string()),
+        ("HEADER_ALIGN", align_of::<SignalHeader>().to_string()),
+        ("MAGIC", format!("b{:?}", core::str::from_utf8(&signal::SIGNAL_MAGIC).unwrap())),
+        ("DESCRIPTION_VERSION", signal::DESCRIPTION_VERSION.to_string()),
+        ("KINDS", format!("({kinds})")),
+        ("TYPES", format!("{{{types}}}")),
+        ("MAX_DESCRIPTION_BYTES", signal::MAX_DESCRIPTION_BYTES.to_string()),
+        ("MAX_VALUES_BYTES", signal::MAX_VALUES_BYTES.to_string()),
+        ("MAX_AHEAD_NS", signal::MAX_AHEAD.as_nanos().to_string()),
+        ("SLOTS", signal::SLOTS.to_string()),
+        ("BUFFER", signal::BUFFER.to_string()),
+        ("MAX_HELD", signal::MAX_HELD.to_string()),
+        ("MAX_PUBLISHERS", signal::MAX_PUBLISHERS.to_string()),
+        ("MAX_SUBSCRIBERS", signal::MAX_SUBSCRIBERS.to_string()),
+        ("MAX_NODES", signal::MAX_NODES.to_string()),
+    ]
 }
 
 fn external_constants() -> Vec<(&'static str, String)> {
@@ -202,6 +237,8 @@ fn enums(out: &mut String) {
     ]
     .map(|(name, flag)| (name.to_owned(), flag.0));
     enumeration(out, "IntFlag", "MotionFlags", "Facts about an IMU sample, one bit each.", &flags);
+    let flags = SignalFlags::ALL.map(|(name, flag)| (name.to_owned(), flag.0));
+    enumeration(out, "IntFlag", "SignalFlags", "Facts about a sample of a signal, one bit each.", &flags);
     external_enums(out);
 }
 

@@ -2,6 +2,7 @@
 
 use crate::{
     CdmRefiner, EngineKind, Error, ErrorKind, FillRefiner, OnnxNetwork, Refiner, RefinerOptions, Result,
+    TinyRefiner,
 };
 
 /// The refiner that `options` ask for.
@@ -12,13 +13,17 @@ use crate::{
 /// [`ErrorKind::OutOfMemory`].
 pub fn refiner(options: &RefinerOptions) -> Result<Box<dyn Refiner>> {
     let engine = options.engine_kind();
-    if engine == EngineKind::Fill {
-        return Ok(Box::new(FillRefiner::new(options.threads)?.with_reach(options.fill_reach)));
+    match engine {
+        EngineKind::Fill => {
+            return Ok(Box::new(FillRefiner::new(options.threads)?.with_reach(options.fill_reach)));
+        }
+        EngineKind::Tiny => return Ok(Box::new(TinyRefiner::open(options)?)),
+        EngineKind::OnnxRuntime => {}
     }
     let Some(model) = &options.model else {
         let message = format!(
             "the engine {engine} needs a model and none was given; install one with `depthrig cdm import FILE` or \
-             `depthrig cdm fetch NAME`, or use the engine fill, which needs none"
+             `depthrig cdm fetch NAME`, or use the engine tiny or fill, which need none"
         );
         return Err(Error::new(ErrorKind::BadInput, message));
     };

@@ -14,7 +14,9 @@
 // The steps of a pixel must end up inside the loops that are compiled for AVX2, whatever their size.
 #![allow(clippy::inline_always)]
 
-use crate::{Color, ColorFormat, Description, Error, ErrorKind, Job, Output, Refiner, Result, StepTimes};
+use crate::{
+    Color, ColorFormat, Description, Error, ErrorKind, Job, Output, RawDepth, Refiner, Result, StepTimes,
+};
 use behind::Behind;
 use clean::Islands;
 use depthrig_bus::HostTime;
@@ -96,13 +98,28 @@ impl FillRefiner {
     fn run(&mut self, job: &mut Job<'_>) -> Result<()> {
         check(job)?;
         let began = HostTime::now();
-        let w = job.color.width;
-        let h = job.color.height;
+        let (loaded, _) = self.fill_every_hole(&job.color, &job.depth);
+        self.forget_far();
+        let filled = HostTime::now();
+        self.store(&mut job.out);
+        job.steps = StepTimes {
+            prepare_ns: loaded.since_ns(began).unsigned_abs(),
+            infer_ns: filled.since_ns(loaded).unsigned_abs(),
+            finish_ns: HostTime::now().since_ns(filled).unsigned_abs(),
+        };
+        Ok(())
+    }
+
+    /// Steps 1 to 4 for images that [`check`] has passed: [`Self::inverse_depth`] is above 0 everywhere, or 0 everywhere without
+    /// any depth. Returns when the first two were done, and whether there is depth.
+    pub(crate) fn fill_every_hole(&mut self, color: &Color<'_>, depth: &RawDepth<'_>) -> (HostTime, bool) {
+        let w = color.width;
+        let h = color.height;
         self.resize(w, h);
         let Self { workers, levels, in_use, cleaned, islands, behind, reach, limit, .. } = self;
         let levels = &mut levels[..*in_use];
-        let Some((full, _)) = levels.split_first_mut() else { return Ok(()) };
-        load::load(workers, &job.color, &job.depth, cleaned, &mut full.color);
+        let Some((full, _)) = levels.split_first_mut() else { return (HostTime::now(), false) };
+        load::load(workers, color, depth, cleaned, &mut full.color);
         workers.rows(&mut full.q, w, |y, row| clean::keep_supported(workers.wide, cleaned, w, y, row));
         let part = |of: f64| (of * (w * h) as f64).round() as u32;
         islands.remove(&mut full.q, w, LEAST_ISLAND.max(part(ISLAND)), part(BODY));
@@ -118,11 +135,9 @@ impl FillRefiner {
             }
         }
         // Filling writes into the cells' depth, but not into how much of them had some.
-        let cells = levels.get(2).filter(|_| *limit < 1.0);
-        if let Some(cells) = cells {
+        if let Some(cells) = levels.get(2).filter(|_| *limit < 1.0) {
             reach.measure(cells);
         }
-        let is_limited = cells.is_some();
         let has_depth = levels.last().is_some_and(|l| l.q.iter().all(|q| *q > 0.0));
         if has_depth {
             for i in (1..levels.len()).rev() {
@@ -134,18 +149,42 @@ impl FillRefiner {
                 }
             }
         }
-        if is_limited {
-            reach.forget(&mut levels[0].q, w, LEAST_REACH.max((*limit * w as f64) as usize));
-        }
-        let filled = HostTime::now();
+        (loaded, has_depth)
+    }
 
-        load::store(workers, &levels[0].q, w, &mut job.out);
-        job.steps = StepTimes {
-            prepare_ns: loaded.since_ns(began).unsigned_abs(),
-            infer_ns: filled.since_ns(loaded).unsigned_abs(),
-            finish_ns: HostTime::now().since_ns(filled).unsigned_abs(),
-        };
-        Ok(())
+    /// Inverse depth of the last image, 1/m, row by row.
+    pub(crate) fn inverse_depth(&self) -> &[f32] {
+        self.levels.first().map_or(&[], |l| &l.q)
+    }
+
+    /// [`Self::inverse_depth`], for a better estimate in its place.
+    pub(crate) fn inverse_depth_mut(&mut self) -> &mut [f32] {
+        self.levels.first_mut().map_or(&mut [], |l| &mut l.q)
+    }
+
+    /// Step 5: empties the inverse depth beyond the reach from what was measured in the last image.
+    pub(crate) fn forget_far(&mut self) {
+        let Self { levels, in_use, reach, limit, .. } = self;
+        // A smaller image has fewer levels in use, and older ones behind them.
+        if *limit < 1.0
+            && *in_use > 2
+            && let Some(full) = levels.first_mut()
+        {
+            let w = full.w;
+            reach.forget(&mut full.q, w, LEAST_REACH.max((*limit * w as f64) as usize));
+        }
+    }
+
+    /// Writes the inverse depth as it was asked for.
+    pub(crate) fn store(&self, out: &mut Output<'_>) {
+        if let Some(full) = self.levels.first() {
+            load::store(&self.workers, &full.q, full.w, out);
+        }
+    }
+
+    /// A row of raw depth as step 1 reads it: inverse depth, 1/m, 0 in holes.
+    pub(crate) fn raw_row(&self, depth: &[u16], unit_m: f64, q: &mut [f32]) {
+        load::inverse_row(self.workers.wide, depth, (1.0 / unit_m) as f32, q);
     }
 
     /// Allocates buffers for images of this size; does nothing if the size is unchanged.
@@ -189,7 +228,7 @@ impl Refiner for FillRefiner {
 mod tests;
 
 /// Whether sizes and units go together.
-fn check(job: &Job<'_>) -> Result<()> {
+pub(crate) fn check(job: &Job<'_>) -> Result<()> {
     let Color { pixels, width, height, stride, format: ColorFormat::Rgb8 | ColorFormat::Bgr8 } = job.color;
     let bad = |message: String| Err(Error::new(ErrorKind::BadInput, message));
     if width == 0 || height == 0 {

@@ -26,6 +26,7 @@ mod refiner;
 pub mod stage;
 mod stereo_network;
 pub mod store;
+pub mod tiny;
 pub mod weights;
 
 pub use arch::Encoder;
@@ -42,4 +43,5 @@ pub use refiner::CdmRefiner;
 pub use stereo_network::FakeNetwork;
 pub use stereo_network::{NetworkPixels, StereoNetwork, StereoNetworkOptions};
 pub use store::ModelStore;
+pub use tiny::TinyRefiner;
 pub use weights::Weights;

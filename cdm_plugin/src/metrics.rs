@@ -1,10 +1,11 @@
-//! Metrics of depth against a reference: L1, RMSE, `AbsRel`, δ0.5, δ1, missing pixels, and the fill rate.
+//! Metrics of depth against a reference: L1, RMSE, `AbsRel`, δ0.5, δ1, δ1.05, δ1.10, missing pixels, and the fill rate.
 //!
 //! With reference depth `d*` and predicted depth `d`, both in metres:
 //! - a reference pixel *counts* when `d*` is finite, above 0 and within the [`DepthRange`];
 //! - it is *valid* when `d` is finite and above 0 as well; there are `N` valid pixels;
 //! - L1 = 1/N Σ|d − d*|, RMSE = √(1/N Σ(d − d*)²), `AbsRel` = 1/N Σ|d − d*|/d*;
-//! - δt = 1/N #{max(d/d*, d*/d) < 1.25^t}, for t = 0.5 (1.118034) and t = 1 (1.25), strictly below;
+//! - δt = 1/N #{max(d/d*, d*/d) < 1.25^t}, for t = 0.5 (1.118034) and t = 1 (1.25), strictly below; δ1.05 and δ1.10
+//!   have the factors 1.05 and 1.10 themselves;
 //! - the *strict* measures are over the pixels that count: a prediction that is missing is one of 0 m, as it is
 //!   stored. Its error is `d*`, its relative error 1, and it is within no factor. Raw sensors have holes and models
 //!   have none, so that comparing on valid pixels alone flatters the sensor; for the same reason `missing_percent`
@@ -23,7 +24,7 @@ mod measured;
 mod sums;
 
 pub use dataset::{Dataset, DatasetMetrics};
-pub use measured::{DistanceBin, ERROR_BOUNDS_M, ErrorHistogram, Measured};
+pub use measured::{DistanceBin, ERROR_BOUNDS_M, ErrorHistogram, Measured, Rules};
 
 /// A depth image, row by row without padding.
 #[derive(Debug, Clone, Copy)]
@@ -60,6 +61,14 @@ impl Depth<'_> {
             Self::Metres(pixels) => f64::from(*pixels.get(i)?),
         };
         (d.is_finite() && d > 0.0).then_some(d)
+    }
+
+    /// Whether pixel `i` is a number, a hole or not.
+    pub(super) fn is_finite(&self, i: usize) -> bool {
+        match self {
+            Self::Units { .. } => true,
+            Self::Metres(pixels) => pixels.get(i).is_some_and(|d| d.is_finite()),
+        }
     }
 
     fn check(&self, what: &str) -> Result<()> {
@@ -110,6 +119,10 @@ pub struct DepthMetrics {
     pub delta_05: f64,
     /// Share of valid pixels within a factor of 1.25.
     pub delta_1: f64,
+    /// Share of valid pixels within a factor of 1.05.
+    pub delta_105: f64,
+    /// Share of valid pixels within a factor of 1.10.
+    pub delta_110: f64,
     /// As `l1_m`, over all valid references; a missing pixel is off by its reference.
     pub strict_l1_m: f64,
     /// As `rmse_m`, over all valid references; a missing pixel is off by its reference.
@@ -120,6 +133,10 @@ pub struct DepthMetrics {
     pub strict_delta_05: f64,
     /// As `delta_1`, over the pixels that count.
     pub strict_delta_1: f64,
+    /// As `delta_105`, over the pixels that count.
+    pub strict_delta_105: f64,
+    /// As `delta_110`, over the pixels that count.
+    pub strict_delta_110: f64,
     /// Pixels that count and have no prediction, percent.
     pub missing_percent: f64,
 }

@@ -50,6 +50,11 @@ pub trait Network: Send {
         1
     }
 
+    /// Whether the first run at a shape takes much longer than the others.
+    fn warms_up(&self) -> bool {
+        false
+    }
+
     /// Gets ready for inputs of `shape`; called before the first [`Self::run`] at it, and again after another shape was
     /// prepared: images of two sizes may take turns.
     ///
@@ -63,4 +68,20 @@ pub trait Network: Send {
     /// # Errors
     /// [`crate::ErrorKind::OutOfMemory`] and [`crate::ErrorKind::Engine`].
     fn run(&mut self, x: &[f32], y: &mut [f32]) -> Result<()>;
+}
+
+/// The network `tiny` on some engine, for one image at a time.
+pub(crate) trait ImageNetwork: Send {
+    /// Gets ready for images of `width` by `height`, multiples of 16, and returns where the input belongs: six planes, and the
+    /// filled inverse depth.
+    ///
+    /// # Errors
+    /// [`crate::ErrorKind::OutOfMemory`] and [`crate::ErrorKind::Engine`].
+    fn inputs(&mut self, width: usize, height: usize) -> Result<(&mut [f32], &mut [f32])>;
+
+    /// Runs the network on the input of the last [`Self::inputs`]: refined inverse depth.
+    ///
+    /// # Errors
+    /// [`crate::ErrorKind::OutOfMemory`] and [`crate::ErrorKind::Engine`].
+    fn run(&mut self) -> Result<&[f32]>;
 }

@@ -17,12 +17,25 @@ use weights::BoundWeights;
 
 pub mod device;
 mod library;
+mod nvidia;
+mod providers;
 pub mod runtime;
 pub mod session;
+mod tiny;
 mod weights;
+
+pub use tiny::TinyNetwork;
 
 /// As many bytes as the name of an engine may have.
 const NAME_BYTES: usize = 31;
+
+/// Where the library is that `device` would run on, without a look into it; arguments and errors as [`find_library`].
+///
+/// # Errors
+/// [`ErrorKind::NoEngine`] when it is missing, [`ErrorKind::BadInput`] for an unknown device.
+pub fn library_file(wanted: Option<&Path>, device: &str) -> Result<PathBuf> {
+    library::find(wanted, std::env::var_os(library::VARIABLE).as_deref(), &device.parse()?)
+}
 
 /// The version of the library that `device` would run on and where it is, without binding this process to it. `wanted` is
 /// the library or its folder; it is looked for without.
@@ -71,12 +84,13 @@ impl OnnxNetwork {
     /// device or the precision, [`ErrorKind::BadInput`] for an unknown device, [`ErrorKind::BadModel`] when a tensor
     /// is missing, [`ErrorKind::OutOfMemory`] and [`ErrorKind::Engine`].
     pub fn open(model: &Model, options: &RefinerOptions) -> Result<Self> {
-        Self::with_architecture(model.encoder.architecture(), &model.weights, options)
+        Self::with_architecture(model.encoder.architecture(), &model.weights, &model.id, options)
     }
 
     fn with_architecture(
         arch: Architecture,
         weights: &Arc<Weights>,
+        id: &str,
         options: &RefinerOptions,
     ) -> Result<Self> {
         let device: Device = options.device.parse()?;
@@ -85,7 +99,7 @@ impl OnnxNetwork {
         let graph = Graph::of_architecture(arch, style(&device, options.precision));
         let weights = BoundWeights::new(weights, &graph.weights)?;
         let threads = options.thread_count();
-        let session = session::open(&runtime, &graph, &weights, &device, options.precision, threads)?;
+        let session = session::open(&runtime, &graph, (&weights, id), &device, options.precision, threads)?;
         let description = describe(&runtime.version, &device, options.precision);
         Ok(Self { description, device, bound: None, session, _weights: weights })
     }
@@ -127,6 +141,11 @@ impl Network for OnnxNetwork {
             // Not measured: there was no GPU.
             Device::Cuda(_) | Device::TensorRt(_) => 4,
         }
+    }
+
+    fn warms_up(&self) -> bool {
+        // They compile for each shape. ONNX Runtime itself only makes room, and one image may take seconds.
+        self.device != Device::Cpu
     }
 
     fn prepare(&mut self, shape: NetShape, positions: &PositionEmbeddings) -> Result<()> {
@@ -205,22 +224,32 @@ const fn style(device: &Device, precision: Precision) -> Style {
 
 /// `onnxruntime 1.31.1 cpu fp32`; with less of the version and of the device when that is too long for a header.
 pub fn describe(version: &str, device: &Device, precision: Precision) -> String {
-    let full = format!("onnxruntime {version} {device} {precision}");
+    describe_as("onnxruntime", version, device, precision)
+}
+
+/// As [`describe`], for another name of the engine.
+fn describe_as(engine: &str, version: &str, device: &Device, precision: Precision) -> String {
+    let full = format!("{engine} {version} {device} {precision}");
     if full.len() <= NAME_BYTES {
         return full;
     }
     let version: Vec<&str> = version.split('.').take(2).collect();
     let mut device = device.to_string();
     device.truncate(device.find(':').unwrap_or(device.len()));
-    let room = NAME_BYTES.saturating_sub("onnxruntime   ".len() + device.len() + precision.name().len());
+    let room = NAME_BYTES.saturating_sub(engine.len() + 3 + device.len() + precision.name().len());
     let mut version = version.join(".");
     version.truncate(room);
-    format!("onnxruntime {version} {device} {precision}")
+    format!("{engine} {version} {device} {precision}")
 }
 
 /// Maps an error of the library.
 pub fn failed(engine: &str, what: &str, error: &ort::Error) -> Error {
     let text = error.message();
+    if let Some((library, cure)) = nvidia::missing(text) {
+        let message =
+            format!("{engine}: {what} failed, because the library {library} is not there: {cure} ({text})");
+        return Error::new(ErrorKind::NoEngine, message);
+    }
     if is_memory(text) {
         let message = format!(
             "{engine}: {what} needs more memory than the device has left ({text}); use a smaller input_size, a smaller \

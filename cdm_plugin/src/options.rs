@@ -11,25 +11,33 @@ use std::path::PathBuf;
 pub enum EngineKind {
     /// Holes filled along the edges of colour: needs no model.
     Fill,
+    /// The small network of this program in ONNX Runtime, on the CPU.
+    Tiny,
     /// The network in ONNX Runtime, a native library that is loaded when it is needed.
     OnnxRuntime,
 }
 
 impl EngineKind {
     /// Every engine.
-    pub const ALL: [Self; 2] = [Self::Fill, Self::OnnxRuntime];
+    pub const ALL: [Self; 3] = [Self::Fill, Self::Tiny, Self::OnnxRuntime];
 
     /// The name used in configuration, on the command line and in headers.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Fill => "fill",
+            Self::Tiny => "tiny",
             Self::OnnxRuntime => "onnxruntime",
         }
     }
 
-    /// Whether it needs a model.
+    /// Whether it needs a model to be named.
     pub const fn needs_model(self) -> bool {
-        !matches!(self, Self::Fill)
+        matches!(self, Self::OnnxRuntime)
+    }
+
+    /// Whether it runs in ONNX Runtime.
+    pub const fn needs_library(self) -> bool {
+        matches!(self, Self::Tiny | Self::OnnxRuntime)
     }
 }
 
@@ -44,7 +52,7 @@ impl FromStr for EngineKind {
 
     fn from_str(s: &str) -> Result<Self> {
         Self::ALL.into_iter().find(|e| e.name() == s).ok_or_else(|| {
-            let message = format!("unknown engine {s:?}: use fill or onnxruntime");
+            let message = format!("unknown engine {s:?}: use fill, tiny or onnxruntime");
             Error::new(ErrorKind::BadInput, message)
         })
     }
@@ -99,8 +107,10 @@ impl FromStr for Precision {
 pub struct RefinerOptions {
     /// Engine; `None` selects ONNX Runtime if there is a model, else `fill`.
     pub engine: Option<EngineKind>,
-    /// The model; every engine but `fill` needs one.
+    /// The model that `onnxruntime` runs.
     pub model: Option<Model>,
+    /// The network that `tiny` runs in place of the one of this program.
+    pub tiny: Option<crate::tiny::TinyFile>,
     /// The shorter side of the network's input, pixels, at least 14; `None` is [`Model::input_size`].
     pub input_size: Option<u32>,
     /// The numbers that the network computes with.
@@ -111,7 +121,7 @@ pub struct RefinerOptions {
     pub threads: usize,
     /// The engine's library, when it is not to be looked for.
     pub library: Option<PathBuf>,
-    /// How far from measured depth `fill` fills holes, as a part of the image's width, 0 to 1; 1 fills every hole.
+    /// How far from measured depth `fill` and `tiny` fill holes, as a part of the image's width, 0 to 1; 1 fills every hole.
     pub fill_reach: f64,
 }
 
@@ -120,6 +130,7 @@ impl Default for RefinerOptions {
         Self {
             engine: None,
             model: None,
+            tiny: None,
             input_size: None,
             precision: Precision::Fp32,
             device: "cpu".into(),

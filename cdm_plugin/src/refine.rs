@@ -98,6 +98,12 @@ pub trait Refiner: Send {
         1
     }
 
+    /// Whether the first image of a size takes much longer than the others, so that
+    /// [`warm_up`](crate::stage::warm_up) is worth its time.
+    fn warms_up(&self) -> bool {
+        false
+    }
+
     /// Refines every job. After an error the outputs hold nothing of use. A job without any depth to go by comes out all
     /// holes and does not fail: in a live view that is a hand in front of the lens.
     ///

@@ -167,6 +167,10 @@ impl Refiner for CdmRefiner {
         self.network.best_batch()
     }
 
+    fn warms_up(&self) -> bool {
+        self.network.warms_up()
+    }
+
     fn refine(&mut self, jobs: &mut [Job<'_>]) -> Result<()> {
         let mut order = core::mem::take(&mut self.order);
         order.clear();

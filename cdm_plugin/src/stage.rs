@@ -7,11 +7,13 @@ pub mod models;
 pub mod pixels;
 mod settings;
 mod view;
+mod warm;
 
-pub use engines::{Installed, Opened, Plan, Refiners, missing};
+pub use engines::{Installed, Opened, Plan, Refiners};
 pub use header::derived_header;
 pub use settings::{CdmConfig, EngineChoice, RefineConfig, RefineModel};
 pub use view::{Correct, View};
+pub use warm::warm_up;
 
 /// The name of the stream of refined depth.
 pub const REFINED: &str = "depth_refined";

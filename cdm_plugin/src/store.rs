@@ -136,7 +136,7 @@ pub fn check_name(name: &str) -> Result<()> {
 /// installed model first.
 pub fn names_a_file(text: &str) -> bool {
     let ending = Path::new(text).extension().and_then(|e| e.to_str()).unwrap_or_default();
-    text.contains('/') || ["safetensors", "pth", "pt", "ckpt", "bin"].contains(&ending)
+    text.contains('/') || ["safetensors", "pth", "pt", "ckpt", "bin", "onnx"].contains(&ending)
 }
 
 impl ModelStore {

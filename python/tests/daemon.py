@@ -31,8 +31,8 @@ class FakeDaemon:
         self._bus = Bus.at(str(folder))
         self._prefix = f"{layout.EXTERNAL_PREFIX}/{rig}/{camera}"
         self._offers = ports.Letters(self._bus, f"{self._prefix}/offer", ports.OFFER, layout.EXTERNAL_OFFER_SIZE)
-        self._answers = ports.Sender(self._bus, f"{self._prefix}/answer", ports.ANSWER, 64, 8, 1)
-        self._bell = ports.Bell(self._bus, f"{self._prefix}/answer")
+        self._answers = ports.Sender(self._bus, f"{self._prefix}/answer", ports.ANSWER, 64, 8, ports.TALK)
+        self._bell = ports.Bell(self._bus, f"{self._prefix}/answer", ports.TALK)
         self._frames: dict[str, Any] = {}
         self._lock = threading.Lock()
         self._number = 0
@@ -105,7 +105,7 @@ class FakeDaemon:
         """As the daemon does before it says `run`."""
         for stream in streams:
             name = f"{self._prefix}/frames/{stream}"
-            service = ports._service(self._bus, name, ports.FRAME, 0)
+            service = ports._service(self._bus, name, ports.FRAME, ports.FRAMES)
             self._frames[stream] = (service, service.subscriber_builder().create())
 
     def run(self, session: int = 1, streams: tuple[str, ...] = ("color",), **fields: Any) -> None:

@@ -21,13 +21,18 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def build_publisher() -> str:
     """The example publisher: from the environment, else built now."""
+    return build_example("publish")
+
+
+def build_example(name: str) -> str:
+    """An example of the bus: beside the publisher that the environment names, else built now."""
     if "DEPTHRIG_TEST_PUBLISHER" in os.environ:
-        return os.environ["DEPTHRIG_TEST_PUBLISHER"]
-    command = ["cargo", "build", "-p", "depthrig-bus", "--example", "publish", "--message-format=json"]
+        return str(Path(os.environ["DEPTHRIG_TEST_PUBLISHER"]).with_name(name))
+    command = ["cargo", "build", "-p", "depthrig-bus", "--example", name, "--message-format=json"]
     built = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, check=True)
     messages = map(json.loads, built.stdout.splitlines())
-    paths = [m["executable"] for m in messages if m.get("target", {}).get("name") == "publish" and m.get("executable")]
-    assert paths, "cargo built no example publisher"
+    paths = [m["executable"] for m in messages if m.get("target", {}).get("name") == name and m.get("executable")]
+    assert paths, f"cargo built no example {name}"
     return paths[-1]
 
 

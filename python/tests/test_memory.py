@@ -13,7 +13,7 @@ import pytest
 from depthrig import BusError, _memory
 from depthrig._bus import Bus
 from depthrig._layout import SHM_PREFIX
-from depthrig._ports import FRAME, Sender
+from depthrig._ports import FRAME, FRAMES, Sender
 from rig import WAIT_S
 
 SLOTS = 6
@@ -23,8 +23,8 @@ HOLD = f"""
 import sys, time
 from depthrig import _layout
 from depthrig._bus import Bus
-from depthrig._ports import FRAME, _service
-service = _service(Bus.at(sys.argv[1]), {CHANNEL!r}, FRAME, 0)
+from depthrig._ports import FRAME, FRAMES, _service
+service = _service(Bus.at(sys.argv[1]), {CHANNEL!r}, FRAME, FRAMES)
 subscriber = service.subscriber_builder().create()
 print("ready", flush=True)
 held = []
@@ -50,7 +50,7 @@ def send(sender: Sender) -> bool:
 @pytest.mark.parametrize("kills", [3])
 def test_slots_of_a_killed_reader_come_back(folder: Path, kills: int) -> None:
     bus = Bus.at(str(folder))
-    sender = Sender(bus, CHANNEL, FRAME, LENGTH, SLOTS, 0)
+    sender = Sender(bus, CHANNEL, FRAME, LENGTH, SLOTS, FRAMES)
     for _ in range(kills):
         reader = subprocess.Popen([sys.executable, "-c", HOLD, str(folder)], stdout=subprocess.PIPE, text=True)
         assert reader.stdout is not None
@@ -70,7 +70,7 @@ def test_slots_of_a_killed_reader_come_back(folder: Path, kills: int) -> None:
 
 
 def test_every_slot_has_memory(folder: Path) -> None:
-    sender = Sender(Bus.at(str(folder)), CHANNEL, FRAME, LENGTH, SLOTS, 0)
+    sender = Sender(Bus.at(str(folder)), CHANNEL, FRAME, LENGTH, SLOTS, FRAMES)
     ending = f"_{sender._publisher.id.value}.data"
     (name,) = [n for n in os.listdir("/dev/shm") if n.startswith(SHM_PREFIX) and n.endswith(ending)]
     stat = os.stat(f"/dev/shm/{name}")
@@ -82,7 +82,7 @@ def test_slots_without_room_are_refused(folder: Path) -> None:
     free = _memory._free()
     assert free is not None
     with pytest.raises(BusError, match=f"no room for its {SLOTS} slots .* would fit; enlarge"):
-        Sender(Bus.at(str(folder)), CHANNEL, FRAME, free // 4, SLOTS, 0)
+        Sender(Bus.at(str(folder)), CHANNEL, FRAME, free // 4, SLOTS, FRAMES)
 
 
 def test_being_out_of_descriptors_is_said() -> None:

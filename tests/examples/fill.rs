@@ -3,12 +3,13 @@
 //! `cargo run --release -p depthrig-tests --example fill [-- FOLDER [MODEL...]]`; without a folder no images are written.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stdout)] // a measuring program: any failure ends it
 
-use depthrig_cdm::metrics::{Dataset, Depth, DepthRange, Measured};
+use depthrig_cdm::metrics::{Dataset, Depth, DepthRange, Measured, Rules};
 use depthrig_cdm::{Color, ColorFormat, FillRefiner, Job, Output, RawDepth, Refiner, StepTimes};
 use depthrig_tests::scene::{MODELS, Scene, Size, places, shoot};
 use std::path::{Path, PathBuf};
 
 const RANGE: DepthRange = DepthRange { min_m: 0.1, max_m: 6.0 };
+const RULES: Rules = Rules { range: RANGE, bin_m: 0.25, bins: 16, skip_not_finite: false };
 
 fn main() {
     let args: Vec<String> = std::env::args().skip(1).collect();
@@ -23,8 +24,8 @@ fn main() {
     for model in models {
         let mut raw_set = Dataset::new(RANGE);
         let mut fill_set = Dataset::new(RANGE);
-        let mut raw_all = Measured::nothing(0.25, 16);
-        let mut fill_all = Measured::nothing(0.25, 16);
+        let mut raw_all = Measured::nothing();
+        let mut fill_all = Measured::nothing();
         let mut best = u64::MAX;
         let mut same = SameSpots::default();
         let mut steps = StepTimes::default();
@@ -46,7 +47,7 @@ fn main() {
                 let unit_m = scene.unit_m;
                 let p = Depth::Units { pixels, unit_m };
                 let t = Depth::Units { pixels: &scene.truth, unit_m };
-                let m = Measured::of(&p, &t, RANGE, (0.25, 16)).unwrap();
+                let m = Measured::of(&p, &t, None, &RULES).unwrap();
                 set.push(&m);
                 all.plus(&m);
             }
@@ -88,9 +89,9 @@ fn main() {
         }
         if folder.is_some() {
             for (a, b) in raw_all
-                .by_distance()
+                .by_distance(&RULES)
                 .iter()
-                .zip(fill_all.by_distance())
+                .zip(fill_all.by_distance(&RULES))
                 .filter(|(a, _)| a.metrics.counted > 0)
             {
                 println!(

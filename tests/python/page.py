@@ -192,6 +192,10 @@ class Wall:
     def wait_for_state(self, selector: str, state: str) -> None:
         self.wait_for("([s, t]) => document.querySelector(s)?.dataset.state === t", selector, state)
 
+    def record_text(self) -> str:
+        """All that the record bar says, for the message of a test that waited in vain."""
+        return f"{self.state('#connection')}: {self.page.inner_text('#record')}"
+
     def tile(self, stream: str) -> Locator:
         return self.page.locator(f'section.tile[data-stream="{stream}"]')
 

@@ -149,9 +149,10 @@ def test_a_page_that_missed_a_start_says_so_and_stops_nothing(browser: Browser, 
         second.open(rig.text)
         second.wait_for_state("#record-state", "idle")
         second.wait_for_image("still/color")
+        first.wait_for_state("#record-state", "idle")
         is_late["now"] = True
         first.page.keyboard.press("Space")
-        first.wait_for_state("#record-state", "recording")
+        until(lambda: first.state("#record-state") == "recording", first.record_text)
         assert second.state("#record-state") == "idle"
         second.page.keyboard.press("Space")
         error = second.page.locator("#record-error")

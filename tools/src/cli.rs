@@ -83,7 +83,7 @@ pub enum Command {
     Edit(edit::EditArgs),
     /// Evaluate depth against a reference (metrics table, HTML report)
     #[command(after_help = eval::EXAMPLES)]
-    Eval(eval::EvalArgs),
+    Eval(Box<eval::EvalArgs>),
     /// Make random scenes with true and measured depth, to train depth models with
     #[command(after_help = scenes::EXAMPLES)]
     Scenes(scenes::ScenesArgs),

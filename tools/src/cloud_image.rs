@@ -21,9 +21,15 @@ const PAPER: Rgb<u8> = Rgb([250, 250, 250]);
 
 /// Draws the points in their colours, nearer ones in front. Without points the drawing is empty.
 pub fn draw(cloud: &PointCloud) -> RgbImage {
+    draw_as(cloud, cloud)
+}
+
+/// The same from where [`draw`] looks at `other`: drawings of clouds that are to be compared.
+pub fn draw_as(cloud: &PointCloud, other: &PointCloud) -> RgbImage {
     let mut image = RgbImage::from_pixel(WIDTH, HEIGHT, PAPER);
     let points: Vec<Vec3> = cloud.points.iter().map(|p| Vec3::from(*p)).collect();
-    let Some(viewpoint) = Viewpoint::new(&points) else { return image };
+    let seen: Vec<Vec3> = other.points.iter().map(|p| Vec3::from(*p)).collect();
+    let Some(viewpoint) = Viewpoint::new(&seen) else { return image };
     let mut nearest = vec![f32::INFINITY; (WIDTH * HEIGHT) as usize];
     for (point, color) in points.iter().zip(&cloud.colors) {
         let Some(seen) = viewpoint.project(*point) else { continue };

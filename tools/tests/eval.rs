@@ -92,6 +92,9 @@ def metrics(p, t, lo, hi):
     mean = lambda x: float(np.mean(x)) if x.size else float("nan")
     return dict(counted=int(t.size), valid=int(a.size), l1_m=mean(np.abs(a - b)), rmse_m=mean((a - b) ** 2) ** 0.5,
         abs_rel=mean(np.abs(a - b) / b), delta_05=mean(f < 1.25 ** 0.5), delta_1=mean(f < 1.25),
+        delta_105=mean(f < 1.05), delta_110=mean(f < 1.10),
+        strict_delta_105=float((f < 1.05).sum()) / t.size if t.size else float("nan"),
+        strict_delta_110=float((f < 1.10).sum()) / t.size if t.size else float("nan"),
         strict_l1_m=mean(np.abs(zero - t)), strict_rmse_m=mean((zero - t) ** 2) ** 0.5,
         strict_abs_rel=mean(np.abs(zero - t) / t),
         strict_delta_05=float((f < 1.25 ** 0.5).sum()) / t.size if t.size else float("nan"),
@@ -194,7 +197,7 @@ fn folders_are_paired_and_the_page_stands_alone() {
     let html = std::fs::read_to_string(&page).unwrap();
     assert!(html.contains("sensor &lt;raw&gt;") && !html.contains("<raw>") && !html.contains(">NaN<"));
     assert!(!html.contains("http://") && !html.contains("https://") && !html.contains("<script"));
-    assert_eq!(html.matches("<svg ").count(), 5, "four curves and the sizes of errors");
+    assert_eq!(html.matches("<svg ").count(), 6, "bars of each, four curves and the sizes of errors");
     assert_eq!(
         html.matches("src=\"data:image/jpeg").count(),
         2 * 3 * 3,
@@ -237,19 +240,32 @@ fn hammers_folders_are_known() {
             npy(&home.path().join(format!("out/{sequence}/{i:06}.npy")), |p| f32::from(truth(k, p)) * 0.002);
         }
     }
-    let got = evaluate(&home, &["@/HAMMER", "--pred", "twice=@/out"]);
-    let row = |name: &str| {
+    let args = ["@/HAMMER", "--pred", "twice=@/out", "--refine", "filled"];
+    let got = evaluate(&home, &args);
+    let row = |group: &str, name: &str| {
         let rows = got["rows"].as_array().unwrap();
-        rows.iter().find(|r| r["name"] == name).unwrap_or_else(|| panic!("{name} in {got}")).clone()
+        let is_it = |r: &&Value| r["name"] == name && r["group"] == group;
+        rows.iter().find(is_it).unwrap_or_else(|| panic!("{group} {name} in {got}")).clone()
     };
-    assert_eq!(got["rows"].as_array().unwrap().len(), 3, "no depth_tof was there");
-    assert_eq!(row("depth_l515")["mean_of_images"]["strict_l1_m"], 0.0);
-    assert!(row("depth_d435")["mean_of_images"]["strict_l1_m"].as_f64().unwrap() > 0.1);
-    let twice = row("twice")["pixel_pooled"]["abs_rel"].as_f64().unwrap();
+    assert_eq!(got["rows"].as_array().unwrap().len(), 5, "no depth_tof was there");
+    assert_eq!(row("depth_l515", "raw")["mean_of_images"]["strict_l1_m"], 0.0);
+    let raw = &row("depth_d435", "raw")["mean_of_images"];
+    assert!(raw["strict_l1_m"].as_f64().unwrap() > 0.1);
+    let filled = &row("depth_d435", "filled")["mean_of_images"];
+    assert!(raw["missing_percent"].as_f64().unwrap() > 5.0 && filled["missing_percent"] == 0.0);
+    let twice = row("HAMMER", "twice")["pixel_pooled"]["abs_rel"].as_f64().unwrap();
     assert!((twice - 1.0).abs() < 1e-6, "{twice}");
+    let scenes = row("depth_d435", "raw")["by_scene"].clone();
+    assert_eq!((&scenes[0]["scene"], &scenes[1]["scene"]), (&"scene1".into(), &"scene2".into()));
+    // The naked sequence alone; and the authors' test scenes, of which there are none.
+    let one = evaluate(&home, &[&args[..], &["--scenes", "*_naked_*"]].concat());
+    assert_eq!(one["rows"][0]["images"], 2);
+    let none = evaluation(&home, &[&args[..], &["--like-cdm"]].concat());
+    assert_eq!(none.code, 1);
+    assert!(none.err.contains("no scene or sequence scene12; there are scene1, scene2"), "{}", none.err);
     let none = home.run(&["eval", home.path().join("out").to_str().unwrap()]);
     assert_eq!(none.code, 1);
-    assert!(none.err.contains("not in the layout of HAMMER"), "{}", none.err);
+    assert!(none.err.contains("nor in the layout of HAMMER"), "{}", none.err);
 }
 
 #[test]
@@ -257,8 +273,8 @@ fn a_recording_with_truth_is_compared_in_one_view() {
     let home = Home::new();
     let cache = home.path().join("cache").display().to_string();
     let text = |truth: bool| {
-        let truths =
-            "[[camera.stream]]\nname = \"depth_true\"\n[[camera.stream]]\nname = \"depth_true_color\"\n";
+        let truths = "[[camera.stream]]\nname = \"depth_true\"\nwidth = 160\nheight = 120\n\
+             [[camera.stream]]\nname = \"depth_true_color\"\nwidth = 160\nheight = 120\n";
         let more = if truth { truths } else { "" };
         format!(
             "rig = \"sim\"\n[recording]\nreserve_mb = 16\n\n[[camera]]\nname = \"cam\"\nbackend = \"synthetic\"\n\
@@ -289,6 +305,18 @@ fn a_recording_with_truth_is_compared_in_one_view() {
     let value = |r: &Value, key: &str| r["mean_of_images"][key].as_f64().unwrap();
     assert!(value(&moved, "delta_1") > 0.98 && value(&moved, "l1_m") < 0.02, "{}", moved["mean_of_images"]);
     assert!(value(&raw, "strict_l1_m") > 2.0 * value(&moved, "strict_l1_m"), "{got}");
+    // Refined depth of the same recording has no holes but what fill leaves; differences are to raw depth.
+    let refined = evaluate_recorded(&home, &[&path, "--refine", "fill", "--refine", "filled"]);
+    let row = |name: &str| {
+        let rows = refined["rows"].as_array().unwrap();
+        rows.iter().find(|r| r["name"] == name).unwrap_or_else(|| panic!("{name} in {refined}")).clone()
+    };
+    assert_eq!(row("depth")["mean_of_images"], raw["mean_of_images"]);
+    assert_eq!(row("filled")["mean_of_images"]["missing_percent"], 0.0);
+    assert!(value(&row("fill"), "missing_percent") < value(&raw, "missing_percent"));
+    assert_eq!(row("fill")["difference"]["to"], "depth");
+    let said = home.run(&["eval", "-q", "--json", &path, "--refine", "fill", "--truth", "depth_true"]);
+    assert!(said.err.contains("refiners need the truth in the view of colour"), "{}", said.err);
     // In depth's own view nothing moves, and the truth is perfect.
     let own = evaluate_recorded(&home, &[&path, "--pred", "depth_true", "--truth", "depth_true"]);
     assert_eq!(own["rows"][0]["mean_of_images"]["strict_l1_m"], 0.0);
@@ -297,4 +325,78 @@ fn a_recording_with_truth_is_compared_in_one_view() {
     let said = home.run(&["eval", "-q", &without]);
     assert_eq!(said.code, 1);
     assert!(said.err.contains("truth = true") && said.err.contains("cam/color"), "{}", said.err);
+}
+
+#[test]
+fn a_model_gives_the_depth_of_cdm_run() {
+    let home = Home::new();
+    let at = |name: &str| home.path().join(name).to_str().unwrap().to_owned();
+    for folder in ["truth", "raw", "rgb", "pred"] {
+        std::fs::create_dir(at(folder)).unwrap();
+    }
+    let model = at("made-up.safetensors");
+    depthrig_cdm::weights::write_seeded(depthrig_cdm::Encoder::Vits, 1, Path::new(&model)).unwrap();
+    for i in 0..2u32 {
+        let raw = |x, y| if roll(i + x / 9, y / 9).is_multiple_of(5) { 0 } else { 800 + x + y + 20 * i };
+        image::RgbImage::from_fn(112, 84, |x, y| {
+            image::Rgb([(x * 2) as u8, (y * 3) as u8, (x * y % 251) as u8])
+        })
+        .save(at(&format!("rgb/{i}.png")))
+        .unwrap();
+        Depth::from_fn(112, 84, |x, y| image::Luma([raw(x, y) as u16]))
+            .save(at(&format!("raw/{i}.png")))
+            .unwrap();
+        Depth::from_fn(112, 84, |x, y| image::Luma([(790 + x + y) as u16]))
+            .save(at(&format!("truth/{i}.png")))
+            .unwrap();
+    }
+    let inputs = ["--truth", &at("truth"), "--raw", &at("raw"), "--rgb", &at("rgb")].map(str::to_owned);
+    let eval = |more: &[&str]| {
+        let inputs: Vec<&str> = inputs.iter().map(String::as_str).collect();
+        home.run(&[&["eval", "-q", "--json", "--input-size", "84"], &inputs[..], more].concat())
+    };
+    let refine = format!("net={model}");
+    let missing = eval(&["--refine", &refine, "--library", "/nonexistent/libonnxruntime.so"]);
+    assert_eq!(missing.code, 1, "{}", missing.err);
+    assert!(missing.err.contains("--refine net: unusable"), "{}", missing.err);
+    assert!(missing.err.contains("/nonexistent/libonnxruntime.so"), "{}", missing.err);
+    for i in 0..2 {
+        let files = [format!("rgb/{i}.png"), format!("raw/{i}.png"), format!("pred/{i}.npy")].map(|f| at(&f));
+        let common = ["cdm", "run", "--depth-unit", "0.001", "--input-size", "84", "--model", &model];
+        let ran = home
+            .run(&[&common[..], &["--rgb", &files[0], "--depth", &files[1], "--out", &files[2]]].concat());
+        let required = std::env::var_os("DEPTHRIG_REQUIRE_ONNXRUNTIME").is_some();
+        if ran.err.contains("ONNX Runtime was not found") && !required {
+            println!("skipped: {}", ran.err);
+            return;
+        }
+        ran.good();
+    }
+    let got: Value =
+        serde_json::from_str(&eval(&["--pred", &at("pred"), "--refine", &refine]).good()).unwrap();
+    let [raw, written, net] = [0, 1, 2].map(|i| got["rows"][i].clone());
+    assert_eq!(
+        (&raw["name"], &written["name"], &net["name"]),
+        (&"raw".into(), &"pred".into(), &"net".into())
+    );
+    assert_eq!(written["mean_of_images"], net["mean_of_images"]);
+    assert!(net["mean_of_images"]["l1_m"].as_f64().unwrap() > 0.001, "{net}");
+    assert!(net["engine"].as_str().unwrap().starts_with("onnxruntime"), "{net}");
+    assert!(net["model"].as_str().unwrap().starts_with("untrained-"), "{net}");
+
+    // A network of the form of `tiny` from a file: here the one of the program, whose numbers are the same.
+    let own = at("my-tiny.onnx");
+    let shipped = concat!(env!("CARGO_MANIFEST_DIR"), "/../cdm_plugin/models/tiny.onnx");
+    std::fs::copy(shipped, &own).unwrap();
+    let of_file = format!("mine={own}");
+    let got: Value = serde_json::from_str(&eval(&["--refine", "tiny", "--refine", &of_file]).good()).unwrap();
+    let [built_in, mine] = [1, 2].map(|i| got["rows"][i].clone());
+    assert_eq!(built_in["mean_of_images"], mine["mean_of_images"]);
+    assert!(built_in["model"].as_str().unwrap().starts_with("tiny@"), "{built_in}");
+    assert!(mine["model"].as_str().unwrap().starts_with("my-tiny@"), "{mine}");
+    std::fs::write(&own, "no network").unwrap();
+    for (text, part) in [(of_file.as_str(), "my-tiny@"), ("gone=gone.onnx", "gone.onnx: cannot be read")] {
+        let refused = eval(&["--refine", text]);
+        assert!(refused.code != 0 && refused.err.contains(part), "{}", refused.err);
+    }
 }

@@ -5,7 +5,7 @@ use super::{
     MAX_HELD, MAX_NODES, MAX_PUBLISHERS, MAX_SUBSCRIBERS, PREFIX, RIG_VARIABLE, SCHEMA,
 };
 use crate::channel::{Channel, Form};
-use crate::{CameraName, Error, ErrorKind, Name, Result, RigName, RuntimeDir, StreamName};
+use crate::{CameraName, Error, ErrorKind, Name, Result, RigName, RuntimeDir, StreamName, shm};
 
 const TALK: Form = Form {
     schema: SCHEMA,
@@ -18,6 +18,7 @@ const TALK: Form = Form {
     notifiers: MAX_EVENT_PORTS,
     listeners: MAX_EVENT_PORTS,
     loans: 2,
+    fewest_slots: shm::MIN_SLOTS,
 };
 /// No history: nobody waits for an old frame.
 const FRAMES: Form = Form { history: 0, loans: 4, ..TALK };

@@ -27,7 +27,8 @@ pub(super) fn load(
 }
 
 wide! {
-fn inverse_row(depth: &[u16], per_unit: f32, q: &mut [f32]) {
+/// Inverse depth of a row, 1/m.
+pub(super) fn inverse_row(depth: &[u16], per_unit: f32, q: &mut [f32]) {
     for (q, d) in q.iter_mut().zip(depth) {
         let inverse = per_unit / f32::from(*d);
         // A unit beyond all reason can make it infinite or 0.

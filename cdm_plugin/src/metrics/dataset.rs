@@ -10,8 +10,8 @@ pub struct Dataset {
     range: DepthRange,
     pooled: Sums,
     /// Sums over the images of the plain measures, and over those that have a strict one.
-    plain: [f64; 5],
-    strict: [f64; 6],
+    plain: [f64; 7],
+    strict: [f64; 8],
     images: u64,
     compared: u64,
     counted: u64,
@@ -37,8 +37,8 @@ impl Dataset {
         Self {
             range,
             pooled: Sums::default(),
-            plain: [0.0; 5],
-            strict: [0.0; 6],
+            plain: [0.0; 7],
+            strict: [0.0; 8],
             images: 0,
             compared: 0,
             counted: 0,
@@ -66,17 +66,17 @@ impl Dataset {
         self.images += 1;
         if m.valid > 0 {
             self.compared += 1;
-            for (sum, value) in
-                self.plain.iter_mut().zip([m.l1_m, m.rmse_m, m.abs_rel, m.delta_05, m.delta_1])
-            {
+            let shares = [m.delta_05, m.delta_1, m.delta_105, m.delta_110];
+            let values = [m.l1_m, m.rmse_m, m.abs_rel].into_iter().chain(shares);
+            for (sum, value) in self.plain.iter_mut().zip(values) {
                 *sum += value;
             }
         }
         if m.counted > 0 {
             self.counted += 1;
             let errors = [m.strict_l1_m, m.strict_rmse_m, m.strict_abs_rel];
-            let shares = [m.strict_delta_05, m.strict_delta_1, m.missing_percent];
-            let values = errors.into_iter().chain(shares);
+            let shares = [m.strict_delta_05, m.strict_delta_1, m.strict_delta_105, m.strict_delta_110];
+            let values = errors.into_iter().chain(shares).chain([m.missing_percent]);
             for (sum, value) in self.strict.iter_mut().zip(values) {
                 *sum += value;
             }
@@ -87,25 +87,27 @@ impl Dataset {
     /// The measures so far.
     pub fn metrics(&self) -> DatasetMetrics {
         let pixel_pooled = self.pooled.metrics();
-        let [l1_m, rmse_m, abs_rel, delta_05, delta_1] = self.plain.map(|s| s / self.compared as f64);
+        let plain = self.plain.map(|s| s / self.compared as f64);
         let strict = self.strict.map(|s| s / self.counted as f64);
-        let [strict_l1_m, strict_rmse_m, strict_abs_rel, strict_delta_05, strict_delta_1, missing_percent] =
-            strict;
         DatasetMetrics {
             mean_of_images: DepthMetrics {
                 counted: pixel_pooled.counted,
                 valid: pixel_pooled.valid,
-                l1_m,
-                rmse_m,
-                abs_rel,
-                delta_05,
-                delta_1,
-                strict_l1_m,
-                strict_rmse_m,
-                strict_abs_rel,
-                strict_delta_05,
-                strict_delta_1,
-                missing_percent,
+                l1_m: plain[0],
+                rmse_m: plain[1],
+                abs_rel: plain[2],
+                delta_05: plain[3],
+                delta_1: plain[4],
+                delta_105: plain[5],
+                delta_110: plain[6],
+                strict_l1_m: strict[0],
+                strict_rmse_m: strict[1],
+                strict_abs_rel: strict[2],
+                strict_delta_05: strict[3],
+                strict_delta_1: strict[4],
+                strict_delta_105: strict[5],
+                strict_delta_110: strict[6],
+                missing_percent: strict[7],
             },
             pixel_pooled,
             images: self.images,

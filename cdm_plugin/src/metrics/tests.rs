@@ -131,7 +131,8 @@ fn slow(prediction: &[f32], reference: &[f32], range: DepthRange) -> DepthMetric
         .collect();
     let n = valid.len() as f64;
     let mean = |f: &dyn Fn(f64, f64) -> f64| valid.iter().map(|(d, t)| f(*d, *t)).sum::<f64>() / n;
-    let hits = |t: f64| valid.iter().filter(|(d, r)| (d / r).max(r / d) < 1.25f64.powf(t)).count() as f64;
+    let within = |f: f64| valid.iter().filter(|(d, r)| (d / r).max(r / d) < f).count() as f64;
+    let hits = |t: f64| within(1.25f64.powf(t));
     let all = counted.len() as f64;
     // Strict: a missing pixel is a prediction of 0.
     let or_zero = |p: f32| if p.is_finite() && p > 0.0 { f64::from(p) } else { 0.0 };
@@ -145,22 +146,25 @@ fn slow(prediction: &[f32], reference: &[f32], range: DepthRange) -> DepthMetric
         abs_rel: mean(&|d, t| (d - t).abs() / t),
         delta_05: hits(0.5) / n,
         delta_1: hits(1.0) / n,
+        delta_105: within(1.05) / n,
+        delta_110: within(1.1) / n,
         strict_l1_m: all_errors.iter().map(|(e, _)| e).sum::<f64>() / all,
         strict_rmse_m: (all_errors.iter().map(|(e, _)| e * e).sum::<f64>() / all).sqrt(),
         strict_abs_rel: all_errors.iter().map(|(e, t)| e / t).sum::<f64>() / all,
         strict_delta_05: hits(0.5) / all,
         strict_delta_1: hits(1.0) / all,
+        strict_delta_105: within(1.05) / all,
+        strict_delta_110: within(1.1) / all,
         missing_percent: 100.0 * (all - n) / all,
     }
 }
 
-fn values(m: &DepthMetrics) -> [f64; 13] {
-    let counted = m.counted as f64;
-    let valid = m.valid as f64;
-    let plain = [m.l1_m, m.rmse_m, m.abs_rel, m.delta_05, m.delta_1];
-    let [a, b, c, d, e] = plain;
-    let [f, g, h] = [m.strict_l1_m, m.strict_rmse_m, m.strict_abs_rel];
-    [counted, valid, a, b, c, d, e, f, g, h, m.strict_delta_05, m.strict_delta_1, m.missing_percent]
+fn values(m: &DepthMetrics) -> Vec<f64> {
+    let plain = [m.l1_m, m.rmse_m, m.abs_rel, m.delta_05, m.delta_1, m.delta_105, m.delta_110];
+    let strict = [m.strict_l1_m, m.strict_rmse_m, m.strict_abs_rel];
+    let shares = [m.strict_delta_05, m.strict_delta_1, m.strict_delta_105, m.strict_delta_110];
+    let counts = [m.counted as f64, m.valid as f64, m.missing_percent];
+    counts.into_iter().chain(plain).chain(strict).chain(shares).collect()
 }
 
 /// Depth that is mostly ordinary and now and then a hole of some kind.
@@ -188,9 +192,29 @@ proptest! {
         // By distance: each bin is the measure of a range, and all of them together are the whole.
         let p = Depth::Metres(&prediction);
         let r = Depth::Metres(&reference);
-        let measured = Measured::of(&p, &r, range, (0.5, 9)).unwrap();
-        prop_assert_eq!(values(&measured.metrics()).map(f64::to_bits), values(&fast).map(f64::to_bits));
-        let bins = measured.by_distance();
+        let rules = Rules { range, bin_m: 0.5, bins: 9, skip_not_finite: false };
+        let materials: Vec<u8> = (0..reference.len()).map(|i| (i % 3) as u8).collect();
+        let measured = Measured::of(&p, &r, Some(&materials), &rules).unwrap();
+        let bits = |m: &DepthMetrics| values(m).into_iter().map(f64::to_bits).collect::<Vec<_>>();
+        prop_assert_eq!(bits(&measured.metrics()), bits(&fast));
+        // A file has the same bits.
+        let text = serde_json::to_string(&measured).unwrap();
+        prop_assert_eq!(&serde_json::from_str::<Measured>(&text).unwrap(), &measured);
+        // Each material is the measure of its pixels alone.
+        for (number, of) in measured.by_material() {
+            let only: Vec<f32> =
+                reference.iter().zip(&materials).map(|(t, m)| if *m == number { *t } else { 0.0 }).collect();
+            let wanted = compare(&p, &Depth::Metres(&only), range).unwrap();
+            prop_assert_eq!(bits(&of), bits(&wanted));
+        }
+        // Left out, NaN is neither right nor wrong.
+        let skipping = Measured::of(&p, &r, None, &Rules { skip_not_finite: true, ..rules }).unwrap();
+        let finite: Vec<f32> =
+            reference.iter().zip(&prediction).map(|(t, p)| if p.is_finite() { *t } else { 0.0 }).collect();
+        let wanted = compare(&p, &Depth::Metres(&finite), range).unwrap();
+        prop_assert_eq!(bits(&skipping.metrics()), bits(&wanted));
+        prop_assert_eq!(skipping.not_finite(), fast.counted - wanted.counted);
+        let bins = measured.by_distance(&rules);
         prop_assert_eq!(bins.iter().map(|b| b.metrics.counted).sum::<u64>(), fast.counted);
         for bin in &bins {
             // The end of a bin belongs to the next one; the last one has none.

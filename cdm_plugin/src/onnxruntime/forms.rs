@@ -33,7 +33,7 @@ fn file(name: &str) -> PathBuf {
 fn open(arch: Architecture, weights: &Arc<Weights>) -> Option<OnnxNetwork> {
     let options = RefinerOptions { threads: 1, ..RefinerOptions::default() };
     let required = std::env::var_os("DEPTHRIG_REQUIRE_ONNXRUNTIME").is_some();
-    match OnnxNetwork::with_architecture(arch, weights, &options) {
+    match OnnxNetwork::with_architecture(arch, weights, "forms", &options) {
         Err(e) if e.kind() == ErrorKind::NoEngine && !required => {
             println!("skipped: {e}");
             None

@@ -121,8 +121,8 @@ pub fn version(path: &Path) -> Result<String> {
 
     // SAFETY: the file is a complete library (checked above), named by who runs this program or found where programs
     // are installed; its initialisers run, as they would if this program were linked to it.
-    let library =
-        unsafe { libloading::Library::new(path) }.map_err(|e| refuse(format!("cannot be loaded: {e}")))?;
+    let library = unsafe { libloading::Library::new(path) }
+        .map_err(|e| refuse(format!("cannot be loaded: {}", cause(&e))))?;
     // SAFETY: a library with this symbol is ONNX Runtime, of which every version has this function with this type
     // (onnxruntime_c_api.h, MIT).
     let base = unsafe { library.get::<unsafe extern "C" fn() -> *const ApiBase>(b"OrtGetApiBase\0") }
@@ -145,6 +145,11 @@ pub fn version(path: &Path) -> Result<String> {
     // Unloading a library that has started threads ends badly, and `ort` is about to load it again anyway.
     core::mem::forget(library);
     Ok(text)
+}
+
+/// The words of the system's loader, which the error itself leaves out.
+pub(super) fn cause(error: &libloading::Error) -> String {
+    core::error::Error::source(error).map_or_else(|| error.to_string(), ToString::to_string)
 }
 
 /// `OrtApiBase`, onnxruntime_c_api.h.

@@ -9,6 +9,9 @@ fn names_fit_into_headers() {
     assert_eq!(of("1.31.1", "cuda:0", Precision::Fp16), "onnxruntime 1.31.1 cuda:0 fp16");
     assert_eq!(of("1.24.1", "openvino", Precision::Bf16), "onnxruntime 1.24 openvino bf16");
     assert_eq!(of("1.31.1", "tensorrt:7", Precision::Fp16), "onnxruntime 1.31 tensorrt fp16");
+    let tiny = |version| describe_as("tiny onnxruntime", version, &Device::Cpu, Precision::Fp32);
+    assert_eq!(tiny("1.31.1"), "tiny onnxruntime 1.31 cpu fp32");
+    assert!(tiny("1.123.45-dev+20261121").len() <= NAME_BYTES);
     for device in ["cpu", "cuda:12", "tensorrt:12", "openvino:GPU.1", "openvino"] {
         let name = of("1.123.45-dev+20261121", device, Precision::Bf16);
         assert!(name.len() <= NAME_BYTES && name.ends_with("bf16"), "{name}");

@@ -1,6 +1,7 @@
 //! The models of this computer, by name or by camera.
 
 use crate::stage::{CdmConfig, RefineModel};
+use crate::tiny::TinyFile;
 use crate::{Encoder, Error, ErrorKind, Model, ModelStore, Result, published};
 
 /// The name of the published model that serves a device, if there is one.
@@ -23,6 +24,20 @@ pub fn open(config: &CdmConfig, model: &RefineModel) -> Result<Model> {
     match model {
         RefineModel::Installed(name) => store(config)?.get(name),
         RefineModel::File(path) => Model::from_file(path),
+    }
+}
+
+/// Reads the network that the engine `tiny` is to run.
+///
+/// # Errors
+/// Those of [`TinyFile::read`]; [`ErrorKind::BadInput`] for the name of an installed model.
+pub fn open_tiny(model: &RefineModel) -> Result<TinyFile> {
+    match model {
+        RefineModel::File(path) => TinyFile::read(path),
+        RefineModel::Installed(name) => {
+            let what = format!("the engine tiny runs a file NAME.onnx, not the installed model {name}");
+            Err(Error::new(ErrorKind::BadInput, what))
+        }
     }
 }
 

@@ -35,7 +35,7 @@ pub struct RefineConfig {
     pub device: String,
     /// `Z16` in the unit of the camera's depth, or `DepthF32`.
     pub format: PixelFormat,
-    /// How far from measured depth the engine `fill` fills holes, as a part of the image's width, 0 to 1; 1 fills every hole.
+    /// How far from measured depth the engines `fill` and `tiny` fill holes, as a part of the image's width, 0 to 1; 1 fills every hole.
     pub fill_reach: f64,
     /// Whether refined depth is recorded.
     pub record: bool,
@@ -52,11 +52,14 @@ pub struct RefineConfig {
 /// Engine that refines depth.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum EngineChoice {
-    /// A model for this camera if one is installed and the library is there, else [`Self::Fill`].
+    /// A model for this camera if one is installed and the library is there, else [`Self::Tiny`] if it is a default and the
+    /// library is there, else [`Self::Fill`].
     #[default]
     Auto,
     /// Hole filling guided by colour; needs no model.
     Fill,
+    /// The small network of this program, after hole filling; needs no model, but ONNX Runtime.
+    Tiny,
     /// ONNX Runtime.
     OnnxRuntime,
     /// Nothing: the stream is there and silent.

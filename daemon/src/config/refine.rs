@@ -5,6 +5,7 @@ use super::value::{MAX_REFINE_HZ, above_zero, not_empty, resolve, within};
 use super::wanted::WantedStream;
 use super::{CdmConfig, EngineChoice, Precision, RefineConfig, RefineModel};
 use depthrig_bus::PixelFormat;
+use depthrig_cdm::tiny;
 use std::path::{Path, PathBuf};
 
 /// The table of a camera's refined depth.
@@ -12,9 +13,10 @@ pub(super) const TABLE: &str = "[camera.refine]";
 /// The streams that it makes.
 pub(super) const COMPUTED: [&str; 2] = [depthrig_cdm::stage::REFINED, depthrig_cdm::stage::ALIGNED];
 
-const ENGINES: [(&str, EngineChoice); 4] = [
+const ENGINES: [(&str, EngineChoice); 5] = [
     ("auto", EngineChoice::Auto),
     ("fill", EngineChoice::Fill),
+    ("tiny", EngineChoice::Tiny),
     ("onnxruntime", EngineChoice::OnnxRuntime),
     ("off", EngineChoice::Off),
 ];
@@ -64,15 +66,27 @@ pub(super) fn read(
         }),
     };
     let at = s.at;
-    if present && config.engine == EngineChoice::Fill && config.model.is_some() {
-        let at = s.at_key("model");
-        s.problem(
-            at,
-            format!(
-                "{} has no use: the engine \"fill\" needs no model; remove one of the two",
-                s.key_of("model")
-            ),
-        );
+    let useless = |key: &'static str, why: String| {
+        let at = s.at_key(key);
+        s.problem(at, format!("{} has no use: {why}; remove one of the two", s.key_of(key)));
+    };
+    let is_tiny_file = |m: &RefineModel| matches!(m, RefineModel::File(path) if tiny::is_tiny_file(path));
+    match (config.engine, &config.model) {
+        (EngineChoice::Fill, Some(_)) if present => {
+            useless("model", "the engine \"fill\" needs no model".to_owned());
+        }
+        (EngineChoice::Tiny, Some(m)) if present && !is_tiny_file(m) => {
+            useless("model", "the engine \"tiny\" runs its own network, or a file NAME.onnx".to_owned());
+        }
+        _ => {}
+    }
+    if present && config.engine == EngineChoice::Tiny {
+        if config.device != "cpu" {
+            useless("device", "the engine \"tiny\" runs on the CPU".to_owned());
+        }
+        if config.precision != Precision::Fp32 {
+            useless("precision", "the engine \"tiny\" computes in fp32".to_owned());
+        }
     }
     s.finish();
     if !present {

@@ -834,12 +834,25 @@ fn what_is_wrong_with_refining_is_named_at_its_line() {
         ("fill_reach = 1.5", 6, "is 1.5; it must be within 0 and 1"),
         ("format = \"rgb8\"", 6, "it is one of: z16, depth_f32"),
         ("engine = \"fill\"\nmodel = \"x\"", 7, "has no use: the engine \"fill\" needs no model"),
+        (
+            "engine = \"tiny\"\nmodel = \"x\"",
+            7,
+            "has no use: the engine \"tiny\" runs its own network, or a file NAME.onnx",
+        ),
+        ("engine = \"tiny\"\nmodel = \"net.pth\"", 7, "or a file NAME.onnx"),
+        ("engine = \"tiny\"\ndevice = \"cuda:0\"", 7, "has no use: the engine \"tiny\" runs on the CPU"),
+        ("engine = \"tiny\"\nprecision = \"fp16\"", 7, "has no use: the engine \"tiny\" computes in fp32"),
+        ("engine = \"tiy\"", 6, "has the invalid value \"tiy\"; did you mean \"tiny\"?"),
+        ("engine = \"tiny\"\nreach = 1", 7, "unknown key \"reach\" in [camera.refine] of camera \"a\""),
         ("[[camera.stream]]\nname = \"depth\"", 5, "[camera.refine] needs the stream \"color\""),
     ] {
         let all = problems(&rig(keys));
         let at = format!("/rigs/rig.toml:{line}:");
         assert!(all.iter().any(|p| p.starts_with(&at) && p.contains(said)), "{keys}: {all:#?}");
     }
+    let tiny = parse(&rig("engine = \"tiny\"\ndevice = \"cpu\"\nfill_reach = 0.3")).unwrap();
+    let tiny = tiny.cameras[0].refine.as_ref().unwrap();
+    assert_eq!((tiny.engine, tiny.fill_reach), (EngineChoice::Tiny, 0.3));
     let recorded = rig("").replace("[camera.refine]", "record = [\"depth_refined\"]");
     assert!(problems(&recorded)[0].contains("which only a camera with [camera.refine] has"));
 }

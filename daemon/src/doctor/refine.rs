@@ -51,16 +51,26 @@ fn of_camera(config: &RigConfig, refine: &RefineConfig, plan: &Plan) -> Vec<Find
     if refine.engine == EngineChoice::Auto
         && let Some(note) = &plan.note
     {
-        findings.push(Finding::new(
-            Severity::Info,
-            "refine_fill",
-            note.as_str(),
-            "fill closes holes along colour and corrects nothing; a camera depth model does both",
-            "install the model (`depthrig cdm import FILE` or `depthrig cdm fetch NAME`), or write engine = \"fill\" if that \
+        let (id, why) = if plan.engine == EngineKind::Tiny {
+            (
+                "refine_tiny",
+                "tiny is trained on simulated cameras; a camera depth model is trained for its camera",
+            )
+        } else {
+            (
+                "refine_fill",
+                "fill closes holes along colour and corrects nothing; a camera depth model does both",
+            )
+        };
+        let cure = format!(
+            "install the model (`depthrig cdm import FILE` or `depthrig cdm fetch NAME`), or write engine = \"{}\" if that \
              is meant",
-        ));
+            plan.engine
+        );
+        findings.push(Finding::new(Severity::Info, id, note.as_str(), why, cure));
     }
-    if plan.engine.needs_model() {
+    // `tiny` may have a network of its own.
+    if plan.engine.needs_model() || (plan.engine == EngineKind::Tiny && plan.model.is_some()) {
         let looked = plan.model.as_ref().map(|m| models::look(&config.cdm, m));
         let missing = match looked {
             Some(Ok(_)) => None,
@@ -73,7 +83,7 @@ fn of_camera(config: &RigConfig, refine: &RefineConfig, plan: &Plan) -> Vec<Find
             findings.push(Finding::new(severity, "model_missing", what, then, cure));
         }
     }
-    if plan.engine == EngineKind::OnnxRuntime
+    if plan.engine.needs_library()
         && let Err(e) = find_library(config.cdm.library.as_deref(), &plan.device, plan.precision)
     {
         let cure = "do what the message says, or use engine = \"fill\"";

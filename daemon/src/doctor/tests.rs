@@ -469,8 +469,9 @@ fn what_keeps_depth_from_being_refined_is_found() {
     let engine = ("engine_missing", Error);
     let no_model = ("model_missing", Error);
     let too_fast = ("refine_too_fast", Warning);
-    let cases: [(&str, &str, &[(&str, Severity)], &str); 13] = [
+    let cases: [(&str, &str, &[(&str, Severity)], &str); 14] = [
         ("d435", "engine = \"fill\"", &[], ""),
+        ("d435", "engine = \"tiny\"", &[engine], "pip install onnxruntime"),
         ("d435", "engine = \"off\"", &[], ""),
         ("d435", "", &[("refine_fill", Info)], "cdm-d435"),
         ("generic", "", &[("refine_fill", Info)], "no camera depth model is known for"),

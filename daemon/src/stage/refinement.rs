@@ -213,6 +213,11 @@ impl Refinement {
         }
     }
 
+    /// Width and height of the images that it refines.
+    pub fn image_size(&self) -> (usize, usize) {
+        (self.refined.profile.width as usize, self.refined.profile.height as usize)
+    }
+
     /// Its streams.
     pub fn streams(&self) -> impl Iterator<Item = &Arc<Stream>> {
         core::iter::once(&self.refined).chain(&self.aligned)

@@ -8,7 +8,7 @@ use crate::wake::Wake;
 use core::time::Duration;
 use depthrig_bus::HostTime;
 use depthrig_bus::sync::lock;
-use depthrig_cdm::stage::{Opened, Plan, Refiners};
+use depthrig_cdm::stage::{Opened, Plan, Refiners, warm_up};
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
@@ -165,6 +165,11 @@ impl RefinerSupervisor {
             // Before the engine makes threads of its own, which inherit it.
             priority::lower_current_thread();
             let opened = refiners.open(&plan, threads).map_err(|e| e.to_string());
+            let opened = opened.and_then(|mut opened| {
+                let sizes: Vec<_> = lock(&theirs.refinements).iter().map(|r| r.image_size()).collect();
+                warm_up(&mut *opened.refiner, &sizes).map_err(|e| e.to_string())?;
+                Ok(opened)
+            });
             let worked = opened.and_then(|Opened { refiner, note }| {
                 let description = refiner.describe().clone();
                 tracing::info!(

@@ -1,4 +1,4 @@
-"""Read the streams of a depthrig camera rig as NumPy arrays in shared memory, and serve cameras to it.
+"""Read the streams of a depthrig camera rig as NumPy arrays in shared memory, serve cameras to it, publish signals.
 
 >>> import depthrig
 >>> with depthrig.Stream("d435/depth") as stream:
@@ -23,20 +23,31 @@ from ._layout import (
     FrameFlags,
     MotionFlags,
     PixelFormat,
+    SignalFlags,
     StageStep,
 )
 from ._runtime import running_rigs
 from ._sets import FrameSet, Sets
+from ._signal import Signal, signals
+from ._signal_description import SignalDescription, SignalField
+from ._signal_reader import SignalReader
+from ._signal_sample import SignalSample, SignalWindow
 from ._stream import Stream, streams
 from .errors import (
     AmbiguousRig,
     BadFrame,
+    BadSignal,
     BusError,
     CameraRefused,
     CameraServed,
     DepthrigError,
     HoldingTooMany,
     RigNotRunning,
+    SignalChanged,
+    SignalGap,
+    SignalNotFound,
+    SignalOutside,
+    SignalTaken,
     Stale,
     StreamGone,
     StreamNotFound,
@@ -50,6 +61,7 @@ __all__ = [
     "MOTION_DTYPE",
     "AmbiguousRig",
     "BadFrame",
+    "BadSignal",
     "BusError",
     "CameraRefused",
     "CameraServed",
@@ -77,6 +89,18 @@ __all__ = [
     "RigNotRunning",
     "SetReader",
     "Sets",
+    "Signal",
+    "SignalChanged",
+    "SignalDescription",
+    "SignalField",
+    "SignalFlags",
+    "SignalGap",
+    "SignalNotFound",
+    "SignalOutside",
+    "SignalReader",
+    "SignalSample",
+    "SignalTaken",
+    "SignalWindow",
     "StageStep",
     "Stale",
     "Stream",
@@ -85,5 +109,6 @@ __all__ = [
     "Timeout",
     "VersionMismatch",
     "running_rigs",
+    "signals",
     "streams",
 ]

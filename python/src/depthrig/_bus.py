@@ -7,12 +7,12 @@ import os
 import threading
 import time
 import weakref
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 from . import _layout
 from ._memory import check_room, out_of_descriptors
-from ._runtime import holder, not_running
-from .errors import BusError, DepthrigError, HoldingTooMany, StreamNotFound, VersionMismatch
+from .errors import BusError, DepthrigError, HoldingTooMany, VersionMismatch
 
 _PIP = "pip install 'iceoryx2==0.10.*'"
 _WHEEL = "0.10."
@@ -147,26 +147,34 @@ class Bus:
 
 
 class Receiver:
-    """The reading end of one channel."""
+    """The reading end of one channel, whose publisher has created it. `missing` makes the error when there is none."""
 
-    def __init__(self, bus: Bus, rig: str, channel: str, header: type[ctypes.Structure], what: str) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        channel: str,
+        schema: str,
+        header: type[ctypes.Structure],
+        what: str,
+        missing: Callable[[], DepthrigError],
+    ) -> None:
         self.bus = bus
         self.what = what
         self._forks = _forks
         self._waitset: tuple[Any, Any] | None = None
-        name = iox2.ServiceName.new(f"depthrig/{rig}/{channel}")
-        schema = iox2.AttributeVerifier.new().require(
-            iox2.AttributeKey.new("schema"), iox2.AttributeValue.new(_layout.SCHEMA)
+        name = iox2.ServiceName.new(channel)
+        attributes = iox2.AttributeVerifier.new().require(
+            iox2.AttributeKey.new("schema"), iox2.AttributeValue.new(schema)
         )
 
         def open_service() -> Any:
             builder = bus.node.service_builder(name).publish_subscribe(iox2.Slice[ctypes.c_uint8])
-            return builder.user_header(header).open_with_attributes(schema)
+            return builder.user_header(header).open_with_attributes(attributes)
 
         try:
             self._service = _retry(open_service, iox2.PublishSubscribeOpenError, _PASSING)
         except iox2.PublishSubscribeOpenError as e:
-            raise self._open_error(str(e), rig, channel) from e
+            raise missing() if str(e) == "DoesNotExist" else self._open_error(str(e), schema) from e
         check_room()
         # The publisher creates the channel first and its event right after.
         event_passing = (*_PASSING, "DoesNotExist")
@@ -183,18 +191,11 @@ class Receiver:
                 raise BusError(f"{what}: all of its {limit} places for subscribers are taken; end one of them") from e
             raise BusError(f"{what}: it cannot be subscribed to ({e}); {out_of_descriptors() or 'try again'}") from e
 
-    def _open_error(self, why: str, rig: str, channel: str) -> DepthrigError:
-        if why == "DoesNotExist":
-            streams = self.bus.streams(rig)
-            if streams:
-                return StreamNotFound(f"{self.what}: nobody publishes it; the rig has: {', '.join(streams)}")
-            if holder(self.bus.folder, rig) is None:
-                return not_running(self.bus.folder, rig)
-            return StreamNotFound(f"{self.what}: the rig is running but has no stream yet")
+    def _open_error(self, why: str, schema: str) -> DepthrigError:
         if why in _OTHER_VERSION:
             return VersionMismatch(
                 f"{self.what}: it was made by another version of depthrig or iceoryx2 ({why}); this package reads "
-                f"{_layout.SCHEMA} with iceoryx2 {wheel_version()}; install the `depthrig` package of the daemon's "
+                f"{schema} with iceoryx2 {wheel_version()}; install the `depthrig` package of the daemon's "
                 "version, and restart programs that still hold the stream in the other one"
             )
         if why == "InsufficientPermissions":

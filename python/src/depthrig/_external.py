@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import fcntl
 import os
 import secrets
 import sys
@@ -24,12 +23,10 @@ from ._external_mode import ExternalMode
 from ._external_session import ExternalSession
 from ._header import blank_fields, pack_fields
 from ._layout import ExternalReason, ExternalState, ExternalWant
-from ._ports import ANSWER, OFFER, Bell, Letters, Sender
-from ._runtime import PathLike, check_name, pick_rig, runtime_dir
+from ._ports import ANSWER, OFFER, TALK, Bell, Letters, Sender
+from ._runtime import PathLike, check_name, pick_rig, runtime_dir, take_lock
 from .errors import BusError, CameraRefused, CameraServed, RigNotRunning
 
-# A process that checks the lock holds it for an instant, so one refusal proves nothing.
-_LOCK_ATTEMPTS, _LOCK_PAUSE_S = 20, 0.01
 # A channel whose other end was just killed may need to be cleaned up first.
 _ENDED_GRACE_S = 0.05
 # Answers that are read at a time; the channel keeps no more.
@@ -96,9 +93,9 @@ class ExternalCamera:
             self._prefix = prefix
             length = len(self.modes) * layout.EXTERNAL_MODE_SIZE
             self._letters = Letters(self._bus, f"{prefix}/answer", ANSWER, layout.EXTERNAL_ANSWER_SIZE)
-            self._offers = Sender(self._bus, f"{prefix}/offer", OFFER, length, _OFFER_SLOTS, 1)
-            self._bell = Bell(self._bus, f"{prefix}/offer")
-            self._wake = Bell(self._bus, f"{prefix}/answer")
+            self._offers = Sender(self._bus, f"{prefix}/offer", OFFER, length, _OFFER_SLOTS, TALK)
+            self._bell = Bell(self._bus, f"{prefix}/offer", TALK)
+            self._wake = Bell(self._bus, f"{prefix}/answer", TALK)
         except BaseException:
             os.close(self._lock)
             raise
@@ -345,28 +342,13 @@ def _text(text: str, size: int) -> bytes:
 
 
 def _lock(folder: str, rig: str, camera: str, program: str) -> int:
-    """Take the right to serve the camera; the kernel frees it with the process. Returns the file."""
-    os.makedirs(folder, mode=0o700, exist_ok=True)
-    path = os.path.join(folder, f"{rig}.{camera}{layout.EXTERNAL_LOCK_SUFFIX}")
-    try:
-        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-    except OSError as e:
-        raise BusError(f"{path} cannot be opened ({e.strerror}); run as the daemon's user") from e
-    for _ in range(_LOCK_ATTEMPTS):
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            break
-        except BlockingIOError:
-            time.sleep(_LOCK_PAUSE_S)
-    else:
-        who = os.pread(file, 4096, 0).decode("utf-8", "replace") or "another process"
-        os.close(file)
+    """Take the right to serve the camera; returns the file."""
+    taken = take_lock(os.path.join(folder, f"{rig}.{camera}{layout.EXTERNAL_LOCK_SUFFIX}"), program)
+    if isinstance(taken, str):
         raise CameraServed(
-            f"camera {camera!r} of rig {rig!r} is served already, by {who}; end that first, or serve another camera"
+            f"camera {camera!r} of rig {rig!r} is served already, by {taken}; end that first, or serve another camera"
         )
-    os.ftruncate(file, 0)
-    os.pwrite(file, f"process {os.getpid()} ({program})".encode(), 0)
-    return file
+    return taken
 
 
 _runtime_dir = runtime_dir

@@ -16,7 +16,7 @@ from ._external_answer import Answer
 from ._external_mode import ExternalMode
 from ._frame import _Owner
 from ._layout import ExternalClock, ExternalFrameFlags, ExternalReason, ExternalState, ExternalWant, PixelFormat
-from ._ports import FRAME, Sender, Slot
+from ._ports import FRAME, FRAMES, Sender, Slot
 
 if TYPE_CHECKING:
     from ._external import ExternalCamera
@@ -194,7 +194,7 @@ class _Channel:
         self.mode = mode
         self.length = mode.frame_bytes
         self.shape, self.dtype = mode.shape, mode.dtype
-        self.sender = Sender(bus, name, FRAME, self.length, slots, 0)
+        self.sender = Sender(bus, name, FRAME, self.length, slots, FRAMES)
         self.sequence = 0
         self.no_slot = 0
 

@@ -58,6 +58,28 @@ EXTERNAL_EVENT_ID = 1
 EXTERNAL_RIG_VARIABLE = "DEPTHRIG_RIG"
 EXTERNAL_CAMERA_VARIABLE = "DEPTHRIG_CAMERA"
 
+# Signals: docs/demonstrations.md
+SIGNAL_VERSION = 1
+SIGNAL_SCHEMA = "depthrig.signal/1"
+SIGNAL_PREFIX = "depthrig.signal"
+SIGNAL_LOCK_SUFFIX = ".signal"
+SIGNAL_HEADER_TYPE = "depthrig.SignalHeader.v1"
+SIGNAL_HEADER_SIZE = 128
+SIGNAL_HEADER_ALIGN = 8
+SIGNAL_MAGIC = b"DRSG"
+SIGNAL_DESCRIPTION_VERSION = 1
+SIGNAL_KINDS = ("fields", "joints", "pose")
+SIGNAL_TYPES = {"f64": 8, "f32": 4, "i64": 8, "bool": 1, "text": 4}
+SIGNAL_MAX_DESCRIPTION_BYTES = 4096
+SIGNAL_MAX_VALUES_BYTES = 4096
+SIGNAL_MAX_AHEAD_NS = 100000000
+SIGNAL_SLOTS = 544
+SIGNAL_BUFFER = 512
+SIGNAL_MAX_HELD = 2
+SIGNAL_MAX_PUBLISHERS = 4
+SIGNAL_MAX_SUBSCRIBERS = 8
+SIGNAL_MAX_NODES = 16
+
 
 class PixelFormat(enum.IntEnum):
     """How the pixels of a frame are stored."""
@@ -159,6 +181,15 @@ class MotionFlags(enum.IntFlag):
     FRAME_SYNC = 1
     ACCEL_CLIPPED = 2
     GYRO_CLIPPED = 4
+
+
+class SignalFlags(enum.IntFlag):
+    """Facts about a sample of a signal, one bit each."""
+
+    REPLAYED = 1
+    TIME_UNCERTAIN = 2
+    PUBLISH_TIME = 4
+    INTERPOLATED = 8
 
 
 class ExternalState(enum.IntEnum):
@@ -385,6 +416,25 @@ EXTERNAL_FRAME_FIELDS = (
     ("flags", 88, "u32", 1),
     ("reserved_word", 92, "u32", 1),
     ("reserved", 96, "u64", 4),
+)
+
+
+# (name, offset, element type, elements)
+SIGNAL_FIELDS = (
+    ("magic", 0, "u8", 4),
+    ("version", 4, "u16", 1),
+    ("size", 6, "u16", 1),
+    ("sequence", 8, "u64", 1),
+    ("session", 16, "u64", 1),
+    ("time_ns", 24, "i64", 1),
+    ("publish_time_ns", 32, "i64", 1),
+    ("uncertainty_ns", 40, "u64", 1),
+    ("description_hash", 48, "u64", 1),
+    ("description_len", 56, "u32", 1),
+    ("payload_len", 60, "u32", 1),
+    ("flags", 64, "u32", 1),
+    ("reserved_word", 68, "u32", 1),
+    ("reserved", 72, "u64", 7),
 )
 
 

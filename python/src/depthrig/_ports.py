@@ -1,12 +1,12 @@
-"""The channels of the hand-shake with the daemon, opened or created: the second module that uses iceoryx2.
+"""Channels that either side may open first, so both create them alike: the second module that uses iceoryx2.
 
-docs/external.md has the settings; either side may come first, so they are the same on both.
+They are those of the hand-shake with the daemon (docs/external.md has the settings) and of signals.
 """
 
 from __future__ import annotations
 
 import ctypes
-from typing import Any
+from typing import Any, NamedTuple
 
 import iceoryx2 as iox2
 
@@ -18,26 +18,68 @@ from .errors import BusError, VersionMismatch
 OFFER = _header_type(layout.EXTERNAL_OFFER_TYPE, layout.EXTERNAL_OFFER_SIZE, layout.EXTERNAL_ALIGN)
 ANSWER = _header_type(layout.EXTERNAL_ANSWER_TYPE, layout.EXTERNAL_ANSWER_SIZE, layout.EXTERNAL_ALIGN)
 FRAME = _header_type(layout.EXTERNAL_FRAME_TYPE, layout.EXTERNAL_FRAME_SIZE, layout.EXTERNAL_ALIGN)
+SIGNAL = _header_type(layout.SIGNAL_HEADER_TYPE, layout.SIGNAL_HEADER_SIZE, layout.SIGNAL_HEADER_ALIGN)
 
 # One frame being written, and two on loan at the same time.
 _LOANS = 3
 
 
-def _service(bus: Bus, name: str, header: type[ctypes.Structure], history: int) -> Any:
-    """Open or create a channel of the hand-shake."""
+class Form(NamedTuple):
+    """The limits of a channel. iceoryx2 fixes them while a process holds it open, so all open it with the same ones."""
+
+    schema: str
+    publishers: int
+    subscribers: int
+    buffer: int
+    held: int
+    history: int
+    nodes: int
+    notifiers: int
+    listeners: int
+    what: str
+    """What a process does with its writing end, for messages."""
+
+
+TALK = Form(
+    layout.EXTERNAL_SCHEMA,
+    layout.EXTERNAL_MAX_PUBLISHERS,
+    layout.EXTERNAL_MAX_SUBSCRIBERS,
+    layout.EXTERNAL_BUFFER,
+    layout.EXTERNAL_MAX_HELD,
+    1,
+    layout.EXTERNAL_MAX_NODES,
+    layout.EXTERNAL_MAX_EVENT_PORTS,
+    layout.EXTERNAL_MAX_EVENT_PORTS,
+    "serve the camera",
+)
+FRAMES = TALK._replace(history=0)
+SIGNALS = Form(
+    layout.SIGNAL_SCHEMA,
+    layout.SIGNAL_MAX_PUBLISHERS,
+    layout.SIGNAL_MAX_SUBSCRIBERS,
+    layout.SIGNAL_BUFFER,
+    layout.SIGNAL_MAX_HELD,
+    1,
+    layout.SIGNAL_MAX_NODES,
+    layout.SIGNAL_MAX_PUBLISHERS,
+    layout.SIGNAL_MAX_SUBSCRIBERS,
+    "publish the signal",
+)
+
+
+def _service(bus: Bus, name: str, header: type[ctypes.Structure], form: Form) -> Any:
+    """Open or create a channel."""
     check_room()
     schema = iox2.AttributeVerifier.new().require(
-        iox2.AttributeKey.new("schema"), iox2.AttributeValue.new(layout.EXTERNAL_SCHEMA)
+        iox2.AttributeKey.new("schema"), iox2.AttributeValue.new(form.schema)
     )
 
     def attempt() -> Any:
         builder = bus.node.service_builder(iox2.ServiceName.new(name))
         builder = builder.publish_subscribe(iox2.Slice[ctypes.c_uint8]).user_header(header)
-        builder = builder.max_publishers(layout.EXTERNAL_MAX_PUBLISHERS)
-        builder = builder.max_subscribers(layout.EXTERNAL_MAX_SUBSCRIBERS)
-        builder = builder.subscriber_max_buffer_size(layout.EXTERNAL_BUFFER)
-        builder = builder.subscriber_max_borrowed_samples(layout.EXTERNAL_MAX_HELD)
-        builder = builder.max_nodes(layout.EXTERNAL_MAX_NODES).history_size(history).enable_safe_overflow(True)
+        builder = builder.max_publishers(form.publishers).max_subscribers(form.subscribers)
+        builder = builder.subscriber_max_buffer_size(form.buffer).subscriber_max_borrowed_samples(form.held)
+        builder = builder.max_nodes(form.nodes).history_size(form.history).enable_safe_overflow(True)
         return builder.open_or_create_with_attributes(schema)
 
     try:
@@ -46,15 +88,14 @@ def _service(bus: Bus, name: str, header: type[ctypes.Structure], history: int) 
         raise _open_error(name, str(e)) from e
 
 
-def _events(bus: Bus, name: str) -> Any:
+def _events(bus: Bus, name: str, form: Form) -> Any:
     """Open or create the event of a channel."""
     check_room()
 
     def attempt() -> Any:
         builder = bus.node.service_builder(iox2.ServiceName.new(name)).event()
-        builder = builder.max_notifiers(layout.EXTERNAL_MAX_EVENT_PORTS)
-        builder = builder.max_listeners(layout.EXTERNAL_MAX_EVENT_PORTS)
-        return builder.max_nodes(layout.EXTERNAL_MAX_NODES).open_or_create()
+        builder = builder.max_notifiers(form.notifiers).max_listeners(form.listeners)
+        return builder.max_nodes(form.nodes).open_or_create()
 
     try:
         return _retry(attempt, iox2.EventOpenOrCreateError, _PASSING)
@@ -94,15 +135,15 @@ class Slot:
 class Sender:
     """The writing end of a channel."""
 
-    def __init__(self, bus: Bus, name: str, header: type[ctypes.Structure], length: int, slots: int, history: int):
+    def __init__(self, bus: Bus, name: str, header: type[ctypes.Structure], length: int, slots: int, form: Form):
         self.name = name
-        self._service = _service(bus, name, header, history)
+        self._service = _service(bus, name, header, form)
         builder = self._service.publisher_builder().initial_max_slice_len(max(length, 1))
         builder = builder.allocation_strategy(iox2.AllocationStrategy.Static).max_loaned_samples(_LOANS)
         try:
             self._publisher = builder.override_sample_preallocation(slots).create()
         except iox2.PublisherCreateError as e:
-            cure = out_of_descriptors() or "does another process still serve the camera?"
+            cure = out_of_descriptors() or f"does another process still {form.what}?"
             raise BusError(f"channel {name} cannot be written ({e}): {slots} slots of {length} bytes; {cure}") from e
         back(self._publisher.id.value, slots, name)
 
@@ -125,12 +166,32 @@ class Sender:
         except iox2.ConnectionFailure:
             return None  # a reader that is not yet complete; the next frame tries again
 
+    def send_copy(self, header: int, header_length: int, payload: int, length: int) -> bool:
+        """Send a copy of a header and a payload at these addresses; return whether there was a slot for it."""
+        slot = self.loan(length)
+        if slot is None:
+            return False
+        ctypes.memmove(slot.header_address, header, header_length)
+        ctypes.memmove(slot.address, payload, length)
+        try:
+            slot.send()
+        except iox2.SendError as e:
+            raise BusError(f"channel {self.name}: a sample could not be sent ({e})") from e
+        return True
+
+    def welcome(self) -> None:
+        """Connect readers that joined since the last sample, which they receive."""
+        try:
+            self._publisher.update_connections()
+        except iox2.ConnectionFailure:
+            return  # a reader that is not yet complete; the next sample tries again
+
 
 class Bell:
     """Wakes the readers that wait for a channel."""
 
-    def __init__(self, bus: Bus, name: str) -> None:
-        self._events = _events(bus, name)
+    def __init__(self, bus: Bus, name: str, form: Form) -> None:
+        self._events = _events(bus, name, form)
         event = iox2.EventId.new(layout.EXTERNAL_EVENT_ID)
         try:
             self._notifier = self._events.notifier_builder().default_event_id(event).create()
@@ -151,8 +212,8 @@ class Letters:
     def __init__(self, bus: Bus, name: str, header: type[ctypes.Structure], header_size: int) -> None:
         self.name = name
         self._size = header_size
-        self._service = _service(bus, name, header, 1)
-        self._events = _events(bus, name)
+        self._service = _service(bus, name, header, TALK)
+        self._events = _events(bus, name, TALK)
         try:
             self._subscriber = self._service.subscriber_builder().create()
             with BINDING:

@@ -7,9 +7,10 @@ import os
 import time
 from typing import Generic, TypeVar
 
+from . import _layout
 from ._bus import Bus, Receiver
-from ._runtime import PathLike, not_running, pick_rig, runtime_dir
-from .errors import RigNotRunning, StreamGone, StreamNotFound, Timeout
+from ._runtime import PathLike, holder, not_running, pick_rig, runtime_dir
+from .errors import DepthrigError, RigNotRunning, StreamGone, StreamNotFound, Timeout
 
 T = TypeVar("T")
 Self = TypeVar("Self", bound="Reader")  # type: ignore[type-arg]
@@ -38,13 +39,26 @@ class Reader(Generic[T]):
                 self.rig = pick_rig(path, rig)
                 if not os.path.isdir(path):
                     raise not_running(path, self.rig)
-                what = f"stream {channel} of rig {self.rig!r}"
-                self._receiver = Receiver(Bus.at(path), self.rig, channel, header, what)
+                self._receiver = self._receive(Bus.at(path), channel, header)
                 return
             except (RigNotRunning, StreamNotFound):
                 if time.monotonic() >= deadline:
                     raise
             time.sleep(0.02)
+
+    def _receive(self, bus: Bus, channel: str, header: type[ctypes.Structure]) -> Receiver:
+        rig = self.rig
+        what = f"stream {channel} of rig {rig!r}"
+
+        def missing() -> DepthrigError:
+            streams = bus.streams(rig)
+            if streams:
+                return StreamNotFound(f"{what}: nobody publishes it; the rig has: {', '.join(streams)}")
+            if holder(bus.folder, rig) is None:
+                return not_running(bus.folder, rig)
+            return StreamNotFound(f"{what}: the rig is running but has no stream yet")
+
+        return Receiver(bus, f"depthrig/{rig}/{channel}", _layout.SCHEMA, header, what, missing)
 
     @property
     def _open(self) -> Receiver:

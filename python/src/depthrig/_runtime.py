@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import re
+import time
 from typing import Union
 
 from ._layout import RUNTIME_DIR_VARIABLE
@@ -12,6 +13,8 @@ from .errors import AmbiguousRig, BusError, RigNotRunning
 
 PathLike = Union[str, "os.PathLike[str]"]
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,30}", re.ASCII)
+# A process that checks a lock holds it for an instant, so one refusal proves nothing.
+_LOCK_ATTEMPTS, _LOCK_PAUSE_S = 20, 0.01
 
 
 def check_name(name: str, what: str) -> str:
@@ -48,8 +51,13 @@ def runtime_dir(path: PathLike | None = None) -> str:
 
 def holder(folder: str, rig: str) -> str | None:
     """Return the process that runs `rig` now, in its own words; None without one."""
+    return holder_of(os.path.join(folder, f"{rig}.lock"))
+
+
+def holder_of(path: str) -> str | None:
+    """Return the process that holds the lock `path`, in its own words; None if it is free."""
     try:
-        with open(os.path.join(folder, f"{rig}.lock"), encoding="utf-8", errors="replace") as file:
+        with open(path, encoding="utf-8", errors="replace") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:
@@ -57,6 +65,31 @@ def holder(folder: str, rig: str) -> str | None:
     except OSError:
         pass
     return None
+
+
+def take_lock(path: str, program: str) -> int | str:
+    """Take the lock `path`, which the kernel frees with the process.
+
+    Returns the open file, or the process that holds it in its own words.
+    """
+    os.makedirs(os.path.dirname(path), mode=0o700, exist_ok=True)
+    try:
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    except OSError as e:
+        raise BusError(f"{path} cannot be opened ({e.strerror}); run as the daemon's user") from e
+    for _ in range(_LOCK_ATTEMPTS):
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            break
+        except BlockingIOError:
+            time.sleep(_LOCK_PAUSE_S)
+    else:
+        who = os.pread(file, 4096, 0).decode("utf-8", "replace") or "another process"
+        os.close(file)
+        return who
+    os.ftruncate(file, 0)
+    os.pwrite(file, f"process {os.getpid()} ({program})".encode(), 0)
+    return file
 
 
 def running_rigs(runtime_dir: PathLike | None = None) -> list[str]:

@@ -20,7 +20,7 @@ class StreamNotFound(DepthrigError):
 
 
 class StreamGone(DepthrigError):
-    """The stream has no publisher any more. The same object goes on when there is one again."""
+    """The stream or signal has no publisher any more. The same object goes on when there is one again."""
 
 
 class Timeout(DepthrigError, TimeoutError):
@@ -60,3 +60,32 @@ class CameraServed(DepthrigError):
 
 class CameraRefused(DepthrigError):
     """The daemon refuses the camera that this process offers; the message is the daemon's."""
+
+
+class SignalNotFound(DepthrigError):
+    """Nobody publishes the signal; the message names those that are published."""
+
+
+class SignalTaken(DepthrigError):
+    """Another process publishes the signal; the message names it."""
+
+
+class SignalChanged(DepthrigError):
+    """Another publisher of the signal took over, with other fields. The reader goes on with them when it is asked again."""
+
+
+class SignalGap(DepthrigError):
+    """Two samples of a signal are further apart than the reader allows."""
+
+    def __init__(self, message: str, gap_s: float) -> None:
+        super().__init__(message)
+        self.gap_s = gap_s
+        """Seconds between the two samples."""
+
+
+class SignalOutside(DepthrigError):
+    """A time is not between two samples of the signal that are kept; nothing is extrapolated."""
+
+
+class BadSignal(DepthrigError):
+    """A sample of a signal contradicts its description."""

@@ -23,7 +23,7 @@ pub use sample::contact_sheet;
 /// Version of the layout.
 pub const FORMAT: u32 = 1;
 /// Goes up when the generator makes other samples of the same arguments.
-const GENERATOR: u32 = 1;
+const GENERATOR: u32 = 2;
 /// Samples that a thread makes between two writes.
 const BATCH: usize = 8;
 
@@ -202,6 +202,7 @@ struct Arguments<'a> {
     per_shard: u64,
     cameras: &'a [String],
     sensor: &'static str,
+    hide: f32,
     families: Vec<&'static str>,
     width: u32,
     height: u32,
@@ -238,6 +239,7 @@ fn record(generator: &Generator, plan: &Plan) -> Result<()> {
                 Sensor::Statistical => "statistical",
                 Sensor::Stereo => "stereo",
             },
+            hide: s.hide,
             families: s.families.iter().map(|f| f.name()).collect(),
             width: s.width,
             height: s.height,
@@ -350,6 +352,7 @@ fn make(
     let next = AtomicU64::new(batch.start);
     let work = || {
         let mut made = Vec::new();
+        let mut fill = sample::fill()?;
         loop {
             let number = next.fetch_add(1, Ordering::Relaxed);
             if number >= batch.end {
@@ -359,7 +362,7 @@ fn make(
                 Error::new(ErrorKind::BadInput, format!("sample {number}: {e}")).with_source(e)
             };
             let triplet = generator.sample(number).map_err(wrong)?;
-            made.push((number, sample::members(&triplet, generator.settings())?));
+            made.push((number, sample::members(&triplet, generator.settings(), &mut fill)?));
         }
     };
     let results: Vec<Result<_>> = std::thread::scope(|scope| {

@@ -118,17 +118,25 @@ fn frame(out: &mut String, y_axis: &str, series: &[Series]) -> impl Fn(f64) -> f
     }
     text(out, left - 52.0, top - 22.0, "axis", y_axis);
     let mut x = left + 150.0;
+    let mut y = 8.0;
     for (k, one) in series.iter().enumerate() {
         let k = k % LOOKS;
+        let width = 60.0 + 7.0 * one.name.chars().count() as f64;
+        // Two lines of names fit above the plot.
+        if x + width > right + 20.0 && y < 20.0 {
+            x = left + 150.0;
+            y += 14.0;
+        }
         let _ = write!(
             out,
-            "<line class=\"curve s{k}\" x1=\"{x:.0}\" x2=\"{:.0}\" y1=\"8\" y2=\"8\"/><rect class=\"s{k}\" x=\"{:.0}\" y=\"4\" \
-             width=\"8\" height=\"8\"/>",
+            "<line class=\"curve s{k}\" x1=\"{x:.0}\" x2=\"{:.0}\" y1=\"{y:.0}\" y2=\"{y:.0}\"/><rect class=\"s{k}\" x=\"{:.0}\" \
+             y=\"{:.0}\" width=\"8\" height=\"8\"/>",
             x + 26.0,
-            x + 9.0
+            x + 9.0,
+            y - 4.0
         );
-        text(out, x + 32.0, 12.0, "label", &one.name);
-        x += 60.0 + 7.0 * one.name.chars().count() as f64;
+        text(out, x + 32.0, y + 4.0, "label", &one.name);
+        x += width;
     }
     y_of
 }

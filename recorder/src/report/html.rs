@@ -1,7 +1,7 @@
 //! The report as HTML. Every text from outside goes through [`escape`].
 
 use super::markup::{END_TABLE, escape, row, table};
-use super::pixels::viridis;
+use super::pixels::ramp;
 use super::svg::number;
 use super::{Report, Shown};
 use crate::catalog::Health;
@@ -219,14 +219,11 @@ fn images(out: &mut String, r: &Report) {
         out.push_str("</tr>");
         at += camera.len();
     }
-    let ramp: Vec<_> =
-        (0..=10).map(|i| viridis(1.0 - i as f32 / 10.0).map(|v| v.to_string()).join(",")).collect();
-    let stops: Vec<_> = ramp.iter().map(|rgb| format!("rgb({rgb})")).collect();
     let _ = write!(
         out,
-        "{END_TABLE}<p class=\"cap\">Depth in colours: near <span class=\"ramp\" style=\"background:linear-gradient(90deg,\
-         {})\"></span> far, in the range beside each camera, the same in all sets; black is no depth.</p></section>",
-        stops.join(",")
+        "{END_TABLE}<p class=\"cap\">Depth in colours: near {} far, in the range beside each camera, the same in all sets; black \
+         is no depth.</p></section>",
+        ramp()
     );
 }
 

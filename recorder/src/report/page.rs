@@ -32,6 +32,11 @@ pub fn end(out: &mut String) {
     out.push_str("</body></html>\n");
 }
 
+/// The colours that depth is shown in, from near to far, as an HTML element.
+pub fn ramp() -> String {
+    pixels::ramp()
+}
+
 /// A small copy of an image, to embed in a report.
 pub struct Thumbnail(Small);
 
@@ -42,6 +47,14 @@ impl Thumbnail {
     /// [`crate::ErrorKind::Codec`] when the pixels are not such an image.
     pub fn of(header: &FrameHeader, pixels: &[u8]) -> Result<Self> {
         Ok(Self(Image::new(header, pixels)?.small()))
+    }
+
+    /// The same with at most `width` pixels per row.
+    ///
+    /// # Errors
+    /// As [`Thumbnail::of`].
+    pub fn of_width(header: &FrameHeader, pixels: &[u8], width: u32) -> Result<Self> {
+        Ok(Self(Image::new(header, pixels)?.small_of(width)))
     }
 
     /// The range of metres that shows most of some depth images; `None` without depth.

@@ -31,8 +31,15 @@ const VIRIDIS: [[u8; 3]; 10] = [
     [253, 231, 37],
 ];
 
+/// The colours of depth from near to far, as an HTML element.
+pub(super) fn ramp() -> String {
+    let rgb = (0..=10).map(|i| viridis(1.0 - i as f32 / 10.0).map(|v| v.to_string()).join(","));
+    let stops: Vec<_> = rgb.map(|rgb| format!("rgb({rgb})")).collect();
+    format!("<span class=\"ramp\" style=\"background:linear-gradient(90deg,{})\"></span>", stops.join(","))
+}
+
 /// The colour of `x` from 0 to 1.
-pub(super) fn viridis(x: f32) -> [u8; 3] {
+fn viridis(x: f32) -> [u8; 3] {
     let at = x.clamp(0.0, 1.0) * (VIRIDIS.len() - 1) as f32;
     let i = at as usize;
     let part = at.fract();
@@ -143,7 +150,12 @@ impl<'a> Image<'a> {
 
     /// A copy of at most [`WIDTH`] pixels per row.
     pub(super) fn small(&self) -> Small {
-        let width = self.width.clamp(1, WIDTH);
+        self.small_of(WIDTH)
+    }
+
+    /// A copy of at most `width` pixels per row.
+    pub(super) fn small_of(&self, width: u32) -> Small {
+        let width = self.width.clamp(1, width.max(1));
         let height = (self.height * width / self.width.max(1)).clamp(1, HEIGHT_MAX);
         let along = |i: u32, n: u32, k: u32, size: u32| {
             let at = (u64::from(i) * u64::from(POINTS) + u64::from(k)) * 2 + 1;

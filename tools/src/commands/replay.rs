@@ -83,7 +83,7 @@ struct StartArgs {
     /// Name of the recording's folder [default: from date, time and scene]
     #[arg(long, requires = "record")]
     name: Option<String>,
-    /// Refine depth with auto, fill or onnxruntime [default without ENGINE: auto]
+    /// Refine depth with auto, fill, tiny or onnxruntime [default without ENGINE: auto]
     #[arg(long, value_name = "ENGINE", num_args = 0..=1, default_missing_value = "auto", require_equals = true,
           value_parser = engine, conflicts_with = "as_fast_as_possible")]
     refine: Option<EngineChoice>,
@@ -99,8 +99,9 @@ fn engine(text: &str) -> Result<EngineChoice, String> {
     Ok(match text {
         "auto" => EngineChoice::Auto,
         "fill" => EngineChoice::Fill,
+        "tiny" => EngineChoice::Tiny,
         "onnxruntime" => EngineChoice::OnnxRuntime,
-        _ => return Err("use auto, fill or onnxruntime".to_owned()),
+        _ => return Err("use auto, fill, tiny or onnxruntime".to_owned()),
     })
 }
 

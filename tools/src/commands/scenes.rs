@@ -17,8 +17,8 @@ use std::path::{Path, PathBuf};
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-Each sample has colour, the true depth in colour's view, the depth that the camera measures, registered to colour, and
-the material of each pixel. Samples come in shards: tar files in the layout of WebDataset (docs/depth-lab.md).
+Each sample has colour, the true depth in colour's view, the depth that the camera measures, registered to colour, the
+same without holes (as the refiner fill fills them), and the material of each pixel. Samples come in shards: tar files in the layout of WebDataset (docs/depth-lab.md).
 
 A sample depends on the arguments, the seed and its number alone. A shard has its name once it is complete; a run that
 was interrupted goes on where it was. --shard 0/4 makes the first of four parts, on this computer or another one.
@@ -31,6 +31,7 @@ Exit codes: 0 all shards are there, 1 failure, 2 wrong usage, 3 shards are missi
 Examples:
   depthrig scenes --count 20000 --camera d435,l515,zed2i --out train
   depthrig scenes --seed 8 --count 500 --without bottle,cup --out train
+  depthrig scenes --count 20000 --hide 0.5 --out train
   depthrig scenes --count 20000 --sensor stereo --shard 2/8 --out train
   depthrig scenes --count 12 --preview sheet.png";
 
@@ -52,6 +53,9 @@ pub struct ScenesArgs {
     /// Measured depth of stereo cameras: drawn from statistics, or matched from infrared images
     #[arg(long, value_enum, default_value = "statistical")]
     sensor: SensorName,
+    /// Share of the samples in which random regions of measured depth are hidden, 0 to 1
+    #[arg(long, value_name = "SHARE", default_value_t = 0.0)]
+    hide: f32,
     /// Width and height of the images, pixels
     #[arg(long, value_name = "WxH", default_value = "640x480", value_parser = size)]
     size: [u32; 2],
@@ -185,6 +189,7 @@ fn settings(args: &ScenesArgs) -> Result<Settings> {
             SensorName::Statistical => Sensor::Statistical,
             SensorName::Stereo => Sensor::Stereo,
         },
+        hide: args.hide,
         families: all.into_iter().filter(|f| !args.without.contains(f)).collect(),
         meshes,
     })

@@ -1,22 +1,26 @@
 //! The images of a depthrig dataset with ground truth.
 
-use super::read::Metres;
-use super::{Job, Loaded, Source};
-use crate::image_file::depth_m;
+use super::read::{Metres, Raw, to_units};
+use super::{Images, Job, Loaded, Place, Source};
+use crate::image_file::{depth_m, to_rgb};
 use anyhow::{Context, Result, bail};
 use depthrig_bus::sync::lock;
-use depthrig_bus::{FrameHeader, PixelFormat, StreamName};
+use depthrig_bus::{FrameHeader, Intrinsics, PixelFormat, StreamName};
 use depthrig_calib::{PoseExt, Registration, same_view};
+use depthrig_cdm::stage::pixels::UNIT_OF_METRES;
 use depthrig_recorder::{Dataset, DatasetFrame, PixelMode, SetRange, Sets};
 use std::collections::BTreeMap;
 use std::path::Path;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
 /// Streams that are evaluated by default, if present.
 const PREDICTIONS: [&str; 3] = ["depth", "depth_aligned", "depth_refined"];
 /// Streams that serve as ground truth by default, best first.
 const TRUTHS: [&str; 2] = ["depth_true_color", "depth_true"];
+/// Streams that refiners get by default, best first.
+const RAWS: [&str; 2] = ["depth", "depth_aligned"];
+const OTHER_MOMENT: &str = "are of another moment than the truth of their set";
+const NO_TRUTH: &str = "have no truth in their set";
 /// Prediction and truth are of one moment when their capture times are this near: capture times of two streams differ by
 /// half their exposures, and frames of 60 Hz are 16 ms apart.
 const SAME_MOMENT_NS: u64 = 8_000_000;
@@ -34,22 +38,38 @@ struct Shared {
     /// Camera and stream by number.
     streams: Vec<(String, String)>,
     truth: Vec<String>,
+    /// Row of the stream that refiners get.
+    raw: Option<usize>,
+    /// Refiners need colour in the view of the truth.
+    refining: bool,
+    /// Name of the dataset.
+    scene: String,
     /// Registrations that are not in use, by the numbers of the two streams.
     registrations: Mutex<BTreeMap<(usize, usize), Vec<Registration>>>,
-    other_moment: AtomicU64,
-    no_truth: AtomicU64,
+}
+
+/// The streams of a dataset to use; empty lists mean the usual ones.
+pub struct Streams<'a> {
+    /// Streams to evaluate.
+    pub predictions: &'a [StreamName],
+    /// Reference.
+    pub truth: Option<&'a StreamName>,
+    /// Stream that refiners get.
+    pub raw: Option<&'a StreamName>,
+    /// Whether there are refiners.
+    pub refining: bool,
 }
 
 impl FromDataset {
-    /// Opens the dataset at `path`; empty lists mean the usual streams.
-    pub fn open(path: &Path, predictions: &[StreamName], truth: Option<&StreamName>) -> Result<Self> {
+    /// Opens the dataset at `path`.
+    pub fn open(path: &Path, of: &Streams<'_>) -> Result<Self> {
         let dataset = Dataset::open(path)?;
         let records = &dataset.session().streams;
         let streams: Vec<_> =
             records.iter().map(|r| (r.id.camera.to_string(), r.id.stream.to_string())).collect();
         let has = |name: &str| streams.iter().any(|(_, s)| s == name);
         let all = || records.iter().map(|r| r.id.to_string()).collect::<Vec<_>>().join(", ");
-        let truth: Vec<String> = match truth {
+        let truth: Vec<String> = match of.truth {
             Some(name) => vec![name.to_string()],
             None => TRUTHS.iter().filter(|t| has(t)).map(|t| (*t).to_owned()).collect(),
         };
@@ -61,11 +81,25 @@ impl FromDataset {
                 all()
             );
         }
-        let names: Vec<String> = if predictions.is_empty() {
+        let mut names: Vec<String> = if of.predictions.is_empty() {
             PREDICTIONS.iter().filter(|p| has(p)).map(|p| (*p).to_owned()).collect()
         } else {
-            predictions.iter().map(ToString::to_string).collect()
+            of.predictions.iter().map(ToString::to_string).collect()
         };
+        let raw = of.raw.map(ToString::to_string).or_else(|| {
+            let usual = RAWS.iter().find(|r| has(r) && (of.refining || names.iter().any(|n| n == *r)));
+            usual.map(|r| (*r).to_owned())
+        });
+        if let Some(raw) = raw.as_ref().filter(|r| !names.contains(r)) {
+            names.insert(0, raw.clone());
+        }
+        if of.refining && raw.is_none() {
+            bail!(
+                "{}: no camera has a stream {}; name raw depth with --raw",
+                path.display(),
+                RAWS.join(" or ")
+            );
+        }
         if let Some(missing) = names.iter().find(|n| !has(n)) {
             bail!("{}: no camera has a stream {missing}; there are {}", path.display(), all());
         }
@@ -79,12 +113,13 @@ impl FromDataset {
         let total = dataset.session().outcome.as_ref().map_or(0, |o| o.sets_recorded);
         let sets = dataset.sets_with(SetRange::ALL, PixelMode::Stored);
         let shared = Shared {
+            raw: raw.and_then(|r| names.iter().position(|n| *n == r)),
+            refining: of.refining,
+            scene: path.file_name().unwrap_or_default().to_string_lossy().into_owned(),
             names,
             streams,
             truth,
             registrations: Mutex::default(),
-            other_moment: AtomicU64::new(0),
-            no_truth: AtomicU64::new(0),
         };
         Ok(Self { sets, shared: Arc::new(shared), total })
     }
@@ -108,70 +143,137 @@ impl Source for FromDataset {
         Some(Ok(Box::new(move || {
             let mut cameras: Vec<&str> = shared.streams.iter().map(|(c, _)| c.as_str()).collect();
             cameras.dedup();
-            let of_camera = |c: &str| shared.of_camera(c, set.id, &set.frames).transpose();
-            cameras.into_iter().filter_map(of_camera).collect()
+            let mut images = Images::default();
+            for camera in cameras {
+                shared.of_camera(camera, set.id, &set.frames, &mut images)?;
+            }
+            Ok(images)
         })))
     }
 
     fn left_out(&self) -> Vec<String> {
-        let said = |n: &AtomicU64, what: &str| {
-            let n = n.load(Ordering::Relaxed);
-            (n > 0).then(|| format!("{n} images {what}"))
-        };
-        let other = said(&self.shared.other_moment, "are of another moment than the truth of their set");
-        other.into_iter().chain(said(&self.shared.no_truth, "have no truth in their set")).collect()
+        Vec::new()
     }
 }
 
 impl Shared {
-    fn of_camera(&self, camera: &str, set: u64, frames: &[DatasetFrame]) -> Result<Option<Loaded>> {
+    /// Adds what `camera` has in a set.
+    fn of_camera(&self, camera: &str, set: u64, frames: &[DatasetFrame], images: &mut Images) -> Result<()> {
         let frame = |stream: &str| {
             let is_it = |f: &&DatasetFrame| {
                 self.streams.get(f.stream).is_some_and(|(c, s)| c == camera && s == stream)
             };
             frames.iter().find(is_it)
         };
+        let mut omit = |why: &str, n: u64| *images.omitted.entry(why.to_owned()).or_default() += n;
         let wanted: Vec<_> =
             self.names.iter().enumerate().filter_map(|(k, n)| Some((k, frame(n)?))).collect();
         if wanted.is_empty() {
-            return Ok(None);
+            return Ok(());
         }
         let Some(truth_frame) = self.truth.iter().find_map(|t| frame(t)) else {
-            self.no_truth.fetch_add(wanted.len() as u64, Ordering::Relaxed);
-            return Ok(None);
+            omit(NO_TRUTH, wanted.len() as u64);
+            return Ok(());
         };
         let truth = metres(truth_frame)?;
         let mut predictions = Vec::new();
+        let mut raw = None;
         for (k, f) in wanted {
             let off = f.header.capture_time_ns.abs_diff(truth_frame.header.capture_time_ns);
             if off > SAME_MOMENT_NS {
-                self.other_moment.fetch_add(1, Ordering::Relaxed);
-                continue;
+                omit(OTHER_MOMENT, 1);
+            } else if Some(k) == self.raw
+                && (self.refining || f.header.pixel_format() == Some(PixelFormat::Z16))
+            {
+                raw = Some((k, self.raw_in_view_of(f, truth_frame)?));
+            } else {
+                predictions.push((k, self.in_view_of(f, truth_frame)?));
             }
-            predictions.push((k, self.in_view_of(f, truth_frame)?));
         }
-        let color = match frame("color") {
-            Some(f) => Some((f.header, f.decoded()?)),
-            None => None,
+        let color = match frame("color").map(|f| self.color(f, truth_frame)) {
+            // For the report alone it is not needed.
+            Some(Err(_)) if !self.refining => None,
+            color => color.transpose()?,
         };
-        Ok(Some(Loaded {
+        let h = &truth_frame.header;
+        images.loaded.push(Loaded {
             group: camera.to_owned(),
-            name: format!("{camera}, set {set}"),
-            truth,
+            place: Place {
+                name: format!("{camera}, set {set}"),
+                scene: self.scene.clone(),
+                sequence: self.scene.clone(),
+            },
+            lens: Some(h.intrinsics).filter(Intrinsics::is_known),
+            truth: Arc::new(truth),
             predictions,
-            color,
-        }))
+            raw,
+            color: color.map(Arc::new),
+            material: None,
+        });
+        Ok(())
+    }
+
+    /// Colour as RGB; refiners need it in the view of the truth.
+    fn color(&self, frame: &DatasetFrame, truth: &DatasetFrame) -> Result<image::RgbImage> {
+        let a = &frame.header;
+        let b = &truth.header;
+        let same = same_view(
+            (&a.intrinsics, (a.width, a.height), &a.pose),
+            (&b.intrinsics, (b.width, b.height), &b.pose),
+        );
+        if self.refining && !same {
+            bail!(
+                "{}: refiners need the truth in the view of colour, {}x{}; {} is in another one or of another size ({}x{}): use --truth {} \
+                 of that size",
+                a.camera(),
+                a.width,
+                a.height,
+                b.stream(),
+                b.width,
+                b.height,
+                TRUTHS[0]
+            );
+        }
+        to_rgb(a, &frame.decoded()?)
+    }
+
+    /// Raw depth where `truth` looks.
+    fn raw_in_view_of(&self, frame: &DatasetFrame, truth: &DatasetFrame) -> Result<Raw> {
+        let h = &frame.header;
+        if h.pixel_format() != Some(PixelFormat::Z16) {
+            let Metres { width, height, pixels } = self.in_view_of(frame, truth)?;
+            return Ok(Raw { width, height, pixels: to_units(&pixels), unit_m: UNIT_OF_METRES });
+        }
+        let pixels = match self.moved(frame, truth)? {
+            Some(moved) => moved,
+            None => rows(h, &frame.decoded()?)?,
+        };
+        let t = &truth.header;
+        Ok(Raw { width: t.width as usize, height: t.height as usize, pixels, unit_m: h.depth_unit_m })
     }
 
     /// The depth of `frame` where `truth` looks.
     fn in_view_of(&self, frame: &DatasetFrame, truth: &DatasetFrame) -> Result<Metres> {
+        let Some(moved) = self.moved(frame, truth)? else { return metres(frame) };
+        let t = &truth.header;
+        let raw = Raw {
+            width: t.width as usize,
+            height: t.height as usize,
+            pixels: moved,
+            unit_m: frame.header.depth_unit_m,
+        };
+        Ok(raw.metres())
+    }
+
+    /// Depth that looks elsewhere, moved into the view of `truth`; `None` when it is there already.
+    fn moved(&self, frame: &DatasetFrame, truth: &DatasetFrame) -> Result<Option<Vec<u16>>> {
         let a = &frame.header;
         let b = &truth.header;
         let view = |h: &FrameHeader| (h.intrinsics, (h.width, h.height), h.pose);
         let (ka, sa, pa) = view(a);
         let (kb, sb, pb) = view(b);
         if frame.stream == truth.stream || same_view((&ka, sa, &pa), (&kb, sb, &pb)) {
-            return metres(frame);
+            return Ok(None);
         }
         let what = || format!("{}: depth cannot be registered to the view of its ground truth", a.camera());
         if a.pixel_format() != Some(PixelFormat::Z16) {
@@ -189,8 +291,7 @@ impl Shared {
         let mut out = vec![0u16; sb.0 as usize * sb.1 as usize];
         registration.depth_to_color(&pixels, a.depth_unit_m, &mut out).with_context(what)?;
         self.pool().entry(key).or_default().push(registration);
-        let pixels = out.iter().map(|d| (f64::from(*d) * a.depth_unit_m) as f32).collect();
-        Ok(Metres { width: sb.0 as usize, height: sb.1 as usize, pixels })
+        Ok(Some(out))
     }
 
     fn pool(&self) -> std::sync::MutexGuard<'_, BTreeMap<(usize, usize), Vec<Registration>>> {

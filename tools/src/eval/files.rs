@@ -1,30 +1,18 @@
-//! Folders of depth images, and the layout of the HAMMER dataset.
-//!
-//! HAMMER (Jung et al. 2023, arXiv 2303.14840; `_dataset_processed` as released) is a folder per sequence, such as
-//! `scene2_traj1_1`, with `polarization/` in it: `rgb/`, `_gt/`, `depth_d435/`, `depth_l515/` and `depth_tof/`, whose files
-//! `000000.png` belong together; depth is 16-bit millimetres in the view of `rgb`. These names and the unit are those that
-//! programs reading it use; the dataset itself was not at hand when this was written. Nor is it known whether the tables
-//! of "Manipulation as in Simulation" bound the range of depth or count holes, so both forms are given here.
+//! Folders of depth images: references, predictions, raw depth, colour and materials with the same file names.
 
-use super::read::{ENDINGS, depth};
-use super::{Job, Loaded, Source};
+use super::read::{ENDINGS, Metres, depth, png8, raw};
+use super::scenes::Scenes;
+use super::{Images, Job, Loaded, Place, Source, same_size};
 use anyhow::{Context, Result, bail};
-use depthrig_bus::{FrameHeader, PixelFormat};
+use depthrig_bus::{Intrinsics, files};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// HAMMER's reference, and what its cameras measured.
-const HAMMER_TRUTH: &str = "_gt";
-const HAMMER_DEPTH: [&str; 3] = ["depth_d435", "depth_l515", "depth_tof"];
-const HAMMER_COLOR: &str = "rgb";
-const HAMMER_VIEW: &str = "polarization";
-/// Metres per unit of HAMMER's files.
-pub const HAMMER_UNIT_M: f64 = 0.001;
-/// Depth that evaluations of HAMMER count, metres.
-pub const HAMMER_RANGE_M: (f64, f64) = (0.1, 6.0);
 /// How deep folders are searched.
 const DEEPEST: usize = 8;
+/// Name of the row of raw depth.
+pub const RAW: &str = "raw";
 
 /// A folder of predictions with its name.
 #[derive(Debug, Clone)]
@@ -37,117 +25,159 @@ pub struct Named {
     pub unit_m: f64,
 }
 
+/// Folders beside each other.
+pub struct Pairs<'a> {
+    /// References.
+    pub truth: &'a Path,
+    /// Metres per unit of integer references.
+    pub truth_unit_m: f64,
+    /// Folders to compare.
+    pub predictions: &'a [Named],
+    /// Raw depth for refiners.
+    pub raw: Option<&'a Named>,
+    /// Colour.
+    pub color: Option<&'a Path>,
+    /// Materials.
+    pub material: Option<&'a Path>,
+    /// Lens of every image.
+    pub lens: Option<Intrinsics>,
+    /// The chosen scenes: folders.
+    pub scenes: &'a Scenes,
+    /// Resize predictions to their reference.
+    pub resize: bool,
+}
+
 /// References with the files that belong to them.
 pub struct Files {
     names: Vec<String>,
-    units: Arc<Vec<f64>>,
-    truth_unit_m: f64,
-    group: String,
+    /// How every file is read.
+    form: Arc<Form>,
     items: std::vec::IntoIter<Item>,
     total: u64,
     left_out: Vec<String>,
 }
 
-struct Item {
-    name: String,
-    truth: PathBuf,
-    predictions: Vec<(usize, PathBuf)>,
-    color: Option<PathBuf>,
+/// How files are read.
+pub struct Form {
+    /// Metres per unit of predictions, by row.
+    pub units: Vec<f64>,
+    /// Metres per unit of references.
+    pub truth_unit_m: f64,
+    /// Metres per unit of raw depth.
+    pub raw_unit_m: f64,
+    /// Resize predictions to their reference.
+    pub resize: bool,
+}
+
+/// Raw depth of a reference from one sensor.
+pub struct Sensor {
+    /// Group of its rows.
+    pub group: String,
+    /// Row of the raw depth.
+    pub row: usize,
+    /// Its file.
+    pub path: PathBuf,
+}
+
+/// A reference.
+pub struct Item {
+    /// Where it comes from.
+    pub place: Place,
+    /// The file.
+    pub truth: PathBuf,
+    /// Raw depth.
+    pub sensors: Vec<Sensor>,
+    /// Group of the predictions, which is also a sensor's if they are of it.
+    pub group: String,
+    /// Predictions by row.
+    pub predictions: Vec<(usize, PathBuf)>,
+    /// Colour.
+    pub color: Option<PathBuf>,
+    /// Materials.
+    pub material: Option<PathBuf>,
+    /// Lens.
+    pub lens: Option<Intrinsics>,
 }
 
 impl Files {
-    /// Pairs the files of `truth` with those of the same path, but for the ending, in each of `predictions`.
-    pub fn pairs(
-        predictions: &[Named],
-        (truth, truth_unit_m): (&Path, f64),
-        color: Option<&Path>,
-    ) -> Result<Self> {
-        let truths = by_stem(truth, &ENDINGS)?;
+    /// Pairs the files of `truth` with those of the same path, but for the ending, in each of the other folders.
+    pub fn pairs(of: &Pairs<'_>) -> Result<Self> {
+        let truths = by_stem(of.truth, &ENDINGS)?;
         if truths.is_empty() {
-            bail!("{}: contains no depth images; supported are {}", truth.display(), ENDINGS.join(", "));
+            bail!("{}: contains no depth images; supported are {}", of.truth.display(), ENDINGS.join(", "));
         }
-        let found = predictions.iter().map(|p| by_stem(&p.folder, &ENDINGS)).collect::<Result<Vec<_>>>()?;
-        let colors = color.map(|c| by_stem(c, &["png", "jpg", "jpeg"])).transpose()?.unwrap_or_default();
+        let found =
+            of.predictions.iter().map(|p| by_stem(&p.folder, &ENDINGS)).collect::<Result<Vec<_>>>()?;
+        let optional = |folder: Option<&Path>, endings: &[&str]| -> Result<BTreeMap<String, PathBuf>> {
+            Ok(folder.map(|f| by_stem(f, endings)).transpose()?.unwrap_or_default())
+        };
+        let raws = optional(of.raw.map(|r| r.folder.as_path()), &ENDINGS)?;
+        let colors = optional(of.color, &["png", "jpg", "jpeg"])?;
+        let materials = optional(of.material, &["png"])?;
+        let first = usize::from(of.raw.is_some());
         let items = truths.into_iter().map(|(stem, truth)| {
-            let of = |(k, f): (usize, &BTreeMap<String, PathBuf>)| Some((k, f.get(&stem)?.clone()));
-            let predictions = found.iter().enumerate().filter_map(of).collect();
-            Item { color: colors.get(&stem).cloned(), name: stem, truth, predictions }
-        });
-        Self::new(predictions, truth_unit_m, "", items.collect())
-    }
-
-    /// Everything below `root` that is laid out as HAMMER. Further `predictions` have the same folders,
-    /// `SEQUENCE/000000.png`, or `SEQUENCE/polarization/000000.png`.
-    pub fn hammer(root: &Path, predictions: &[Named]) -> Result<Self> {
-        let mut views = Vec::new();
-        find_views(root, 0, &mut views)?;
-        if views.is_empty() {
-            let shape = format!("SEQUENCE/{HAMMER_VIEW}/{HAMMER_TRUTH}/000000.png");
-            bail!("{}: not in the layout of HAMMER: it contains no {shape}", root.display());
-        }
-        views.sort();
-        let raw = HAMMER_DEPTH.map(|name| Named {
-            name: name.into(),
-            folder: PathBuf::new(),
-            unit_m: HAMMER_UNIT_M,
-        });
-        let named: Vec<Named> = raw.into_iter().chain(predictions.iter().cloned()).collect();
-        let mut items = Vec::new();
-        for view in views {
-            let sequence = view.parent().and_then(Path::file_name).unwrap_or_default();
-            for (stem, truth) in by_stem(&view.join(HAMMER_TRUTH), &["png"])? {
-                let raw = HAMMER_DEPTH.iter().map(|d| view.join(d).join(format!("{stem}.png"))).enumerate();
-                let mut files: Vec<_> = raw.filter(|(_, p)| p.is_file()).collect();
-                for (k, p) in predictions.iter().enumerate() {
-                    let folders = [p.folder.join(sequence), p.folder.join(sequence).join(HAMMER_VIEW)];
-                    let paths = folders.iter().flat_map(|f| ENDINGS.map(|e| f.join(format!("{stem}.{e}"))));
-                    files.extend(
-                        paths.into_iter().find(|p| p.is_file()).map(|path| (HAMMER_DEPTH.len() + k, path)),
-                    );
-                }
-                let color = Some(view.join(HAMMER_COLOR).join(format!("{stem}.png"))).filter(|p| p.is_file());
-                items.push(Item {
-                    name: format!("{}/{stem}", sequence.display()),
-                    truth,
-                    predictions: files,
-                    color,
-                });
+            let path = |(k, f): (usize, &BTreeMap<String, PathBuf>)| Some((first + k, f.get(&stem)?.clone()));
+            let predictions = found.iter().enumerate().filter_map(path).collect();
+            let sensor = |path: &PathBuf| Sensor { group: String::new(), row: 0, path: path.clone() };
+            let folder = Path::new(&stem).parent().map(|p| p.display().to_string()).unwrap_or_default();
+            Item {
+                sensors: raws.get(&stem).map(sensor).into_iter().collect(),
+                color: colors.get(&stem).cloned(),
+                material: materials.get(&stem).cloned(),
+                place: Place { name: stem, scene: folder.clone(), sequence: folder },
+                truth,
+                group: String::new(),
+                predictions,
+                lens: of.lens,
             }
-        }
-        Self::new(&named, HAMMER_UNIT_M, "HAMMER", items)
+        });
+        let items = of.scenes.keep(items.collect(), |i| &i.place)?;
+        let form = Form {
+            units: of.raw.iter().copied().chain(of.predictions).map(|p| p.unit_m).collect(),
+            truth_unit_m: of.truth_unit_m,
+            raw_unit_m: of.raw.map_or(of.truth_unit_m, |r| r.unit_m),
+            resize: of.resize,
+        };
+        let names = of.raw.iter().copied().chain(of.predictions).map(|p| p.name.clone()).collect();
+        Self::new(names, form, items)
     }
 
-    fn new(predictions: &[Named], truth_unit_m: f64, group: &str, mut items: Vec<Item>) -> Result<Self> {
+    /// From items; those without any prediction are left out.
+    pub fn new(names: Vec<String>, form: Form, mut items: Vec<Item>) -> Result<Self> {
         let mut left_out = Vec::new();
-        for (k, p) in predictions.iter().enumerate() {
-            let has = |i: &&Item| i.predictions.iter().any(|(n, _)| *n == k);
-            let n = items.iter().filter(has).count();
+        let mut missing = |name: &str, has: &dyn Fn(&Item) -> bool, known: bool| {
+            let n = items.iter().filter(|i| has(i)).count();
             let first = items.iter().find(|i| !has(i));
-            if let Some(first) = first.filter(|_| n > 0 || !p.folder.as_os_str().is_empty()) {
-                let missing = items.len() - n;
+            if let Some(first) = first.filter(|_| n > 0 || known) {
                 left_out.push(format!(
-                    "{}: {missing} of {} references have no prediction, {} first",
-                    p.name,
+                    "{name}: {} of {} references have no prediction, {} first",
+                    items.len() - n,
                     items.len(),
-                    first.name
+                    first.place.name
                 ));
             }
+        };
+        let mut groups: Vec<&str> = items.iter().flat_map(|i| &i.sensors).map(|s| s.group.as_str()).collect();
+        groups.sort_unstable();
+        groups.dedup();
+        for group in &groups {
+            let name = if group.is_empty() { RAW } else { group };
+            missing(name, &|i| i.sensors.iter().any(|s| s.group == *group), false);
         }
-        items.retain(|i| !i.predictions.is_empty());
+        for (k, name) in names.iter().enumerate() {
+            let is_raw = items.iter().flat_map(|i| &i.sensors).any(|s| s.row == k);
+            if !is_raw {
+                missing(name, &|i| i.predictions.iter().any(|(n, _)| *n == k), true);
+            }
+        }
+        items.retain(|i| !i.predictions.is_empty() || !i.sensors.is_empty());
         if items.is_empty() {
             bail!(
                 "no reference has a prediction: files belong together when their paths are the same but for the ending"
             );
         }
-        Ok(Self {
-            names: predictions.iter().map(|p| p.name.clone()).collect(),
-            units: Arc::new(predictions.iter().map(|p| p.unit_m).collect()),
-            truth_unit_m,
-            group: group.into(),
-            total: items.len() as u64,
-            items: items.into_iter(),
-            left_out,
-        })
+        let total = items.len() as u64;
+        Ok(Self { names, form: Arc::new(form), items: items.into_iter(), total, left_out })
     }
 }
 
@@ -162,29 +192,8 @@ impl Source for Files {
 
     fn next(&mut self) -> Option<Result<Job>> {
         let item = self.items.next()?;
-        let units = Arc::clone(&self.units);
-        let unit_m = self.truth_unit_m;
-        let group = self.group.clone();
-        Some(Ok(Box::new(move || {
-            let truth = depth(&item.truth, unit_m)?;
-            let mut predictions = Vec::new();
-            for (k, path) in &item.predictions {
-                let p = depth(path, units[*k])?;
-                if (p.width, p.height) != (truth.width, truth.height) {
-                    bail!(
-                        "{}: it has {}x{} pixels and its reference {}x{}; compare images of one view and size",
-                        path.display(),
-                        p.width,
-                        p.height,
-                        truth.width,
-                        truth.height
-                    );
-                }
-                predictions.push((*k, p));
-            }
-            let color = item.color.as_deref().map(color).transpose()?;
-            Ok(vec![Loaded { group, name: item.name, truth, predictions, color }])
-        })))
+        let form = Arc::clone(&self.form);
+        Some(Ok(Box::new(move || read(item, &form))))
     }
 
     fn left_out(&self) -> Vec<String> {
@@ -192,15 +201,55 @@ impl Source for Files {
     }
 }
 
-fn color(path: &Path) -> Result<(FrameHeader, Vec<u8>)> {
-    let image = crate::image_file::open(path)?.into_rgb8();
-    let mut header = FrameHeader::default();
-    header.set_image(PixelFormat::Rgb8, image.width(), image.height());
-    Ok((header, image.into_raw()))
+/// Reads a reference and what belongs to it.
+fn read(item: Item, form: &Form) -> Result<Images> {
+    let truth = Arc::new(depth(&item.truth, form.truth_unit_m)?);
+    let mut predictions = Vec::new();
+    for (k, path) in &item.predictions {
+        let mut p = depth(path, form.units[*k])?;
+        let size = (truth.width, truth.height);
+        if form.resize && (p.width, p.height) != size && p.width > 0 && p.height > 0 {
+            p = p.resized(size);
+        }
+        same_size(&path.display().to_string(), (p.width, p.height), &truth)?;
+        predictions.push((*k, p));
+    }
+    let color = item.color.as_deref().map(crate::image_file::open).transpose()?;
+    let color = color.map(|c| Arc::new(c.into_rgb8()));
+    let material = item.material.as_deref().map(|p| material(p, &truth)).transpose()?.map(Arc::new);
+    let loaded = |group: String, predictions: Vec<(usize, Metres)>| Loaded {
+        group,
+        place: item.place.clone(),
+        truth: Arc::clone(&truth),
+        predictions,
+        raw: None,
+        color: color.clone(),
+        material: material.clone(),
+        lens: item.lens,
+    };
+    let mut images = Images::default();
+    for sensor in item.sensors {
+        let raw = raw(&sensor.path, form.raw_unit_m)?;
+        same_size(&sensor.path.display().to_string(), (raw.width, raw.height), &truth)?;
+        let own = if sensor.group == item.group { std::mem::take(&mut predictions) } else { Vec::new() };
+        images.loaded.push(Loaded { raw: Some((sensor.row, raw)), ..loaded(sensor.group, own) });
+    }
+    if !predictions.is_empty() {
+        images.loaded.push(loaded(item.group.clone(), predictions));
+    }
+    Ok(images)
+}
+
+fn material(path: &Path, truth: &Metres) -> Result<Vec<u8>> {
+    let what = || format!("{}: cannot be read as materials", path.display());
+    let bytes = files::read(path, files::IMAGE_MAX_BYTES).with_context(what)?;
+    let (size, numbers) = png8(&bytes).with_context(what)?;
+    same_size(&path.display().to_string(), size, truth)?;
+    Ok(numbers)
 }
 
 /// The files of `folder` and the folders in it, by path below it without the ending.
-fn by_stem(folder: &Path, endings: &[&str]) -> Result<BTreeMap<String, PathBuf>> {
+pub fn by_stem(folder: &Path, endings: &[&str]) -> Result<BTreeMap<String, PathBuf>> {
     let mut found = BTreeMap::new();
     collect(folder, folder, endings, 0, &mut found)?;
     Ok(found)
@@ -231,25 +280,6 @@ fn collect(
         let stem = stem.strip_prefix(root).unwrap_or(&stem).to_string_lossy().into_owned();
         if let Some(other) = found.insert(stem, path.clone()) {
             bail!("{} and {} have one name; keep one of them", other.display(), path.display());
-        }
-    }
-    Ok(())
-}
-
-fn find_views(folder: &Path, depth: usize, views: &mut Vec<PathBuf>) -> Result<()> {
-    if folder.file_name().is_some_and(|n| n == HAMMER_VIEW) && folder.join(HAMMER_TRUTH).is_dir() {
-        views.push(folder.to_owned());
-        return Ok(());
-    }
-    if depth >= 4 {
-        return Ok(());
-    }
-    let entries =
-        std::fs::read_dir(folder).with_context(|| format!("{}: cannot be read", folder.display()))?;
-    for entry in entries {
-        let path = entry.with_context(|| format!("{}: cannot be read", folder.display()))?.path();
-        if path.is_dir() {
-            find_views(&path, depth + 1, views)?;
         }
     }
     Ok(())

@@ -80,6 +80,26 @@ fn what_is_no_onnx_runtime() {
     }
 }
 
+#[test]
+fn a_library_that_lacks_another_says_which() {
+    let dir = tempfile::tempdir().unwrap();
+    let other = library(dir.path(), "libother.so.7", "int other(void) { return 7; }");
+    let source = dir.path().join("needs.c");
+    std::fs::write(&source, "int other(void); int needs(void) { return other(); }").unwrap();
+    let needs = dir.path().join("libneeds.so");
+    let mut cc = Command::new("cc");
+    cc.args(["-shared", "-fPIC", "-L"])
+        .arg(dir.path())
+        .arg("-l:libother.so.7")
+        .arg("-o")
+        .arg(&needs)
+        .arg(&source);
+    assert!(cc.arg("-Wl,--no-as-needed").arg("-l:libother.so.7").status().unwrap().success());
+    std::fs::remove_file(other).unwrap();
+    let message = version(&needs).unwrap_err().to_string();
+    assert!(message.contains("libother.so.7: cannot open shared object file"), "{message}");
+}
+
 /// The loader of the system would end the process with a bus error.
 #[test]
 fn a_library_that_is_cut_short() {

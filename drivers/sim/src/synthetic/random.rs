@@ -4,7 +4,6 @@ use super::motion::look_at;
 use super::scene::{Lamp, Thing, World};
 use super::shape::{Mesh, Shape, Solid};
 use super::texture::{Look, Paint, Pattern, Surface};
-use draw::Draw;
 use glam::{DAffine3, DMat3, Mat3, Vec3};
 use objects::Object;
 use std::sync::Arc;
@@ -14,6 +13,7 @@ mod family;
 mod material;
 mod objects;
 
+pub(crate) use draw::Draw;
 pub use family::Family;
 
 /// Height of a table's top over the floor, metres.

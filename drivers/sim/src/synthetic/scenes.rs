@@ -16,7 +16,7 @@ use super::color;
 use super::depth;
 use super::models::{self, DepthPrinciple, MODELS, Mode, Model};
 use super::noise::mix;
-use super::random::{RandomWorld, Stock};
+use super::random::{Draw, RandomWorld, Stock};
 use super::scene::World;
 use super::shape::Mesh;
 use super::texture::{DARK_ALBEDO, Surface};
@@ -27,7 +27,9 @@ use depthrig_driver::{Error, ErrorKind, Result};
 use glam::Vec3;
 use std::sync::Arc;
 
+mod hide;
 mod ir;
+mod optics;
 
 pub use super::random::{Family, SceneKind};
 
@@ -70,6 +72,8 @@ pub struct Settings {
     pub cameras: Vec<String>,
     /// How depth is measured.
     pub sensor: Sensor,
+    /// Share of the samples in which random regions of measured depth are hidden, 0 to 1.
+    pub hide: f32,
     /// Families of objects.
     pub families: Vec<Family>,
     /// Meshes for [`Family::Mesh`].
@@ -84,6 +88,7 @@ impl Default for Settings {
             height: 480,
             cameras: vec!["d435".to_owned()],
             sensor: Sensor::Statistical,
+            hide: 0.0,
             families: Family::ALL.into_iter().filter(|f| *f != Family::Mesh).collect(),
             meshes: Vec::new(),
         }
@@ -101,6 +106,8 @@ pub struct Triplet {
     pub truth: Vec<u16>,
     /// Measured depth in colour's view, in `raw_unit_m`; 0 is a hole.
     pub raw: Vec<u16>,
+    /// Share of the measured pixels that were hidden at random, and are holes in `raw`.
+    pub hidden: f32,
     /// Material of the first surface: 0 nothing, 1 diffuse, 2 glossy, 3 metal, 4 glass, 5 dark.
     pub material: Vec<u8>,
     /// Metres per count of measured depth.
@@ -162,6 +169,12 @@ impl Generator {
                 ))
             })
         };
+        if !(0.0..=1.0).contains(&settings.hide) {
+            return Err(bad(format!(
+                "share of samples with hidden depth {} is out of range 0..=1",
+                settings.hide
+            )));
+        }
         let meshes = settings.meshes.iter().map(checked).collect::<Result<Vec<_>>>()?;
         let stock = Stock { families: settings.families.clone(), meshes };
         Ok(Self { settings, models, stock })
@@ -179,6 +192,7 @@ impl Generator {
     pub fn sample(&self, number: u64) -> Result<Triplet> {
         let Settings { seed, width, height, sensor, .. } = self.settings;
         let model = self.models[(number % self.models.len() as u64) as usize];
+        let model = &varied(model, &mut Draw::new(seed, number, 5));
         let RandomWorld { world, kind, families, camera_pose } = RandomWorld::new(seed, number, &self.stock);
         let optics = Optics::new(model, seed, number, (width, height));
         let noise = mix(seed ^ mix(number.wrapping_add(0x5CE4E)));
@@ -186,7 +200,8 @@ impl Generator {
         let rays = Rays::new(&optics.color, width, height);
         let view = View::new(&rays, &(camera_pose * model.color_in_device.to_affine()));
         let mets = view.cast(&world);
-        let color = color::render_met(&world, &view, &mets, model.white, noise);
+        let mut color = color::render_met(&world, &view, &mets, model.white, noise);
+        optics::blemish(&mut Draw::new(seed, number, 3), &mut color, width as usize);
         let truth = mets.iter().map(|m| if *m == NOTHING { 0 } else { depth::counts(m.t, TRUTH_UNIT_M) });
         let material = mets.iter().map(|m| material_of(&world, m.key)).collect();
 
@@ -205,12 +220,19 @@ impl Generator {
         } else {
             depth::sense(&world, &depth_view, &depth_view.cast(&world), model, noise)
         };
-        let raw = if is_same { sensed } else { register(&optics, model, (width, height), &sensed)? };
+        let mut raw = if is_same { sensed } else { register(&optics, model, (width, height), &sensed)? };
+        let mut draw = Draw::new(seed, number, 4);
+        let hidden = if draw.chance(self.settings.hide) {
+            hide::hide(&mut draw, &mut raw, (width, height), |i| mets[i].key)
+        } else {
+            0.0
+        };
         Ok(Triplet {
             number,
             color,
             truth: truth.collect(),
             raw,
+            hidden,
             material,
             raw_unit_m: model.depth_unit_m,
             camera: model.name,
@@ -224,6 +246,29 @@ impl Generator {
             intrinsics: optics.color,
         })
     }
+}
+
+/// The same model with more or less noise; a projector fails now and then, as in the sun.
+fn varied(model: &Model, draw: &mut Draw) -> Model {
+    let noise = draw.scale(0.6, 1.7);
+    let other = draw.scale(0.5, 2.0);
+    let is_outshone = draw.chance(0.12);
+    let depth = match model.depth {
+        DepthPrinciple::Stereo { baseline_m, projector, sigma_px, search_px } => DepthPrinciple::Stereo {
+            baseline_m,
+            projector: projector && !is_outshone,
+            sigma_px: sigma_px * noise,
+            search_px,
+        },
+        DepthPrinciple::TimeOfFlight { sigma_m, multipath_m, half_angle_deg } => {
+            DepthPrinciple::TimeOfFlight {
+                sigma_m: sigma_m * noise,
+                multipath_m: multipath_m * other,
+                half_angle_deg,
+            }
+        }
+    };
+    Model { depth, ..*model }
 }
 
 /// Depth in colour's view.

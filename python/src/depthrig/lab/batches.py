@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader, Dataset
 from .config import Config
 from .data import Source
 from .errors import LabError
-from .fill import fill
+from .fill import filled_of
 from .sample import Sample
 from .synthesis import synthesise
 
@@ -77,12 +77,11 @@ def example(sample: Sample, config: Config, rng: np.random.Generator) -> Example
     # Of the whole image: a crop has no borders of its own.
     planes: Planes = {"color": color, "raw": raw[cut], "seen": seen_of(raw)[cut]}
     planes["truth"] = np.zeros((height, width), np.float32) if truth is None else truth[cut]
+    if config.model.kind == "tiny":
+        planes["filled"] = filled_of(sample, planes["raw"], cut)
     if config.train.flip and rng.random() < 0.5:
         planes = {name: plane[:, ::-1] for name, plane in planes.items()}
     planes["color"] = planes["color"].transpose(2, 0, 1)
-    if config.model.kind == "tiny":
-        measured = planes["raw"] > 0
-        planes["filled"] = fill(np.where(measured, 1 / np.where(measured, planes["raw"], 1), 0))
     return Example(sample.name, {name: np.ascontiguousarray(plane) for name, plane in planes.items()})
 
 

@@ -98,8 +98,10 @@ class SynthesisConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """The loss, of inverse depth."""
+    """The loss."""
 
+    space: str = "inverse"
+    """Errors are of `inverse` depth, 1/m, or of its logarithm (`log`), in which near and far count alike."""
     gradient: float = 0.5
     """Weight of the difference of gradients; the paper prints 1, PromptDA has 0.5."""
     missing: float = 1.0
@@ -108,6 +110,7 @@ class LossConfig:
     far_m: float = 6.0
 
     def __post_init__(self) -> None:
+        _one_of("space", self.space, ("inverse", "log"))
         _within("gradient", self.gradient, 0, 100)
         _within("missing", self.missing, 0.01, 100)
         _within("near_m", self.near_m, 0.01, 100)

@@ -1,6 +1,6 @@
 """Holes of an image filled without a model: pull and push over halved images, in inverse depth.
 
-A stand-in for `fill` of the daemon while training: the same pyramid, without its cleaning and without colour.
+A stand-in for `fill` of the daemon where a sample lacks its result: the same pyramid, without cleaning and colour.
 """
 
 from __future__ import annotations
@@ -10,7 +10,29 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["fill"]
+from .sample import Sample
+
+__all__ = ["fill", "filled_of", "inverse_of"]
+
+WHOLE = (slice(None), slice(None))
+
+
+def inverse_of(depth: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return 1/m of metres; 0 stays 0."""
+    known = depth > 0
+    return np.where(known, 1 / np.where(known, depth, 1), 0).astype(depth.dtype)
+
+
+def filled_of(
+    sample: Sample, raw: npt.NDArray[np.float32], cut: tuple[slice, slice] = WHOLE
+) -> npt.NDArray[np.float32]:
+    """Return inverse depth without holes of a part of a sample: as the sample has it, else of the part alone.
+
+    :param raw: depth of the part.
+    """
+    if sample.filled is not None:
+        return inverse_of(sample.filled[cut])
+    return fill(inverse_of(raw))
 
 
 def _halve(sums: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -20,7 +20,7 @@ def inverse(depth: Tensor) -> Tensor:
 
 
 def refine_loss(predicted: Tensor, truth: Tensor, raw: Tensor, config: LossConfig) -> Tensor:
-    """Return the L1 and gradient loss of inverse depth.
+    """Return the L1 and gradient loss of inverse depth, or of its logarithm (`config.space`).
 
     The gradient loss is the mean difference between neighbours' differences, to the right and downwards, where both
     have a truth within the range; it has one scale.
@@ -30,8 +30,12 @@ def refine_loss(predicted: Tensor, truth: Tensor, raw: Tensor, config: LossConfi
     :param raw: metres, 0 for a hole.
     """
     valid = (truth >= config.near_m) & (truth <= config.far_m)
-    target = inverse(truth)
-    error = torch.where(valid, predicted - target, 0.0)
+    if config.space == "log":
+        # A prediction of 0 is depth that cannot be known: it has no logarithm and no say.
+        valid = valid & (predicted > 0)
+        error = torch.where(valid, predicted * truth, 1.0).log()
+    else:
+        error = torch.where(valid, predicted - inverse(truth), 0.0)
     wrong = (raw - truth).abs() > WRONG * truth
     weight = valid * torch.where(wrong, config.missing, 1.0)
     loss = (weight * error.abs()).sum() / weight.sum().clamp_min(1e-6)

@@ -64,6 +64,8 @@ class Sample:
     intrinsics: Intrinsics | None = None
     material: npt.NDArray[np.uint8] | None = None
     """``(height, width)``, numbers of `MATERIALS`."""
+    filled: Depth | None = None
+    """``(height, width)``, metres: raw depth without holes, as `fill` of the daemon gives it; 0 is unknown."""
 
     def __post_init__(self) -> None:
         if self.color.dtype != np.uint8 or self.color.ndim != 3 or self.color.shape[2] != 3 or not self.color.size:
@@ -73,6 +75,7 @@ class Sample:
         planes: tuple[tuple[str, npt.NDArray[Any] | None, type], ...] = (
             ("raw depth", self.raw, np.float32),
             ("truth", self.truth, np.float32),
+            ("filled depth", self.filled, np.float32),
             ("material", self.material, np.uint8),
         )
         for what, plane, dtype in planes:

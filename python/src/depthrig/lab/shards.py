@@ -1,7 +1,8 @@
 """Shards: tar files in the WebDataset layout, written whole or not at all.
 
 A sample is a run of members with one key: ``KEY.color.png``, ``KEY.truth.png``, ``KEY.raw.png``, optionally
-``KEY.material.png``, and last ``KEY.json``. KEY is ten digits, the number of the sample in the whole run.
+``KEY.filled.png`` and ``KEY.material.png``, and last ``KEY.json``. KEY is ten digits, the number of the sample in the
+whole run.
 A file with its final name ends in the two zero blocks of tar; one that does not was cut and is refused.
 """
 
@@ -33,7 +34,7 @@ TRUTH_UNIT_M = 1e-4
 BLOCK = 512
 MEMBERS_MAX = 1 << 28
 """Larger members are refused."""
-NAME = re.compile(r"(?P<key>\d{10})\.(?P<what>color\.png|truth\.png|raw\.png|material\.png|json)")
+NAME = re.compile(r"(?P<key>\d{10})\.(?P<what>color\.png|truth\.png|raw\.png|filled\.png|material\.png|json)")
 OURS = "MIT OR Apache-2.0"
 SHIPPING = {OURS, "MIT", "Apache-2.0", "BSD-3-Clause", "CC0-1.0", "CC BY 4.0", "CC BY-SA 3.0", "your own recordings"}
 """Licences of shards under which a model may ship."""
@@ -125,16 +126,29 @@ class Shard:
     def __len__(self) -> int:
         return len(self.entries)
 
-    def __getitem__(self, index: int) -> Sample:
+    def _read(self, index: int, only: str = "") -> dict[str, bytes]:
         entry = self.entries[index]
         with self.path.open("rb") as file:
             members = {}
             for what, (at, size) in entry.members.items():
+                if only and what != only:
+                    continue
                 file.seek(at)
                 members[what] = file.read(size)
                 if len(members[what]) != size:
                     raise LabError(f"{self.path}: cut short within {entry.key}.{what}; make this shard again")
-        return read_sample(members, f"{self.path}: sample {entry.key}")
+        return members
+
+    def __getitem__(self, index: int) -> Sample:
+        return read_sample(self._read(index), f"{self.path}: sample {self.entries[index].key}")
+
+    def facts(self, index: int) -> dict[str, Any]:
+        """Return what the json of a sample says, such as `sensor` and `scene`."""
+        try:
+            facts = json.loads(self._read(index, "json")["json"])
+        except ValueError as e:
+            raise LabError(f"{self.path}: sample {self.entries[index].key}: invalid json: {e}") from None
+        return facts if isinstance(facts, dict) else {}
 
 
 def read_sample(members: dict[str, bytes], where: str) -> Sample:
@@ -151,6 +165,7 @@ def read_sample(members: dict[str, bytes], where: str) -> Sample:
         coeffs = tuple(float(c) for c in of_camera.get("coeffs") or ())
         intrinsics = Intrinsics(fx, fy, cx, cy, str(of_camera.get("model", "none")), coeffs)
         units = {"truth.png": float(facts["truth_unit_m"]), "raw.png": float(facts["raw_unit_m"])}
+        units["filled.png"] = units["raw.png"]
         size = (int(facts["height"]), int(facts["width"]))
         licence = Licence(str(facts["licence"]), ships=facts["licence"] in SHIPPING)
     except (KeyError, TypeError, ValueError) as e:
@@ -160,7 +175,7 @@ def read_sample(members: dict[str, bytes], where: str) -> Sample:
     if bad := [u for u in units.values() if not 1e-6 <= u <= 1]:
         raise LabError(f"{where}: invalid depth unit {bad[0]} m")
     images: dict[str, Any] = {}
-    for what in ("color.png", "truth.png", "raw.png", "material.png"):
+    for what in ("color.png", "truth.png", "raw.png", "filled.png", "material.png"):
         if what not in members:
             continue
         image = decode_png(members[what], f"{where}: {what}")
@@ -175,7 +190,10 @@ def read_sample(members: dict[str, bytes], where: str) -> Sample:
     material = images.get("material.png")
     if material is not None and material.max() >= len(MATERIALS):
         raise LabError(f"{where}: material {material.max()} is out of range 0..={len(MATERIALS) - 1}")
-    return Sample(where, images["color.png"], licence, images["raw.png"], images["truth.png"], intrinsics, material)
+    filled = images.get("filled.png")
+    return Sample(
+        where, images["color.png"], licence, images["raw.png"], images["truth.png"], intrinsics, material, filled
+    )
 
 
 def to_units(depth: npt.NDArray[np.float32], unit_m: float) -> npt.NDArray[np.uint16]:
@@ -228,6 +246,8 @@ class ShardWriter:
         self._member(f"{key}.color.png", encode_png(sample.color))
         self._member(f"{key}.truth.png", encode_png(to_units(sample.need_truth(), TRUTH_UNIT_M)))
         self._member(f"{key}.raw.png", encode_png(to_units(sample.raw, raw_unit_m)))
+        if sample.filled is not None:
+            self._member(f"{key}.filled.png", encode_png(to_units(sample.filled, raw_unit_m)))
         if sample.material is not None:
             self._member(f"{key}.material.png", encode_png(sample.material))
         self._member(f"{key}.json", json.dumps(record).encode())

@@ -27,7 +27,7 @@ from .batches import Batches, loader, raw_of
 from .config import Config, DataConfig, read
 from .data import Source, open_source
 from .errors import LabError, first_line
-from .fill import fill
+from .fill import filled_of
 from .nets import build
 from .nets.cdm import normalise_color
 from .nets.export import export_tiny
@@ -222,8 +222,7 @@ class _Trainer:
         height, width = (side // multiple * multiple for side in raw.shape)
         truth, material = sample.need_truth()[:height, :width], sample.material
         raw, color = raw[:height, :width], sample.color[:height, :width].transpose(2, 0, 1)
-        measured = raw > 0
-        filled = fill(np.where(measured, 1 / np.where(measured, raw, 1), 0))
+        filled = filled_of(sample, raw, (slice(height), slice(width)))
         planes = {"color": color.astype(np.float32) / 255, "raw": raw, "filled": filled, "truth": truth}
         batch = {n: torch.from_numpy(np.ascontiguousarray(p))[None].to(self.device) for n, p in planes.items()}
         with torch.no_grad():

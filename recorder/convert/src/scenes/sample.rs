@@ -1,6 +1,7 @@
 //! A sample's members, and samples beside each other as one image.
 
 use depthrig_bus::Distortion;
+use depthrig_cdm::{Color, ColorFormat, FillRefiner, Job, Output, RawDepth, Refiner, StepTimes};
 use depthrig_recorder::{Error, ErrorKind, Result};
 use depthrig_sim::synthetic::scenes::{Settings, TRUTH_UNIT_M, Triplet};
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
@@ -21,6 +22,7 @@ struct Record<'a> {
     intrinsics: Lens,
     truth_unit_m: f64,
     raw_unit_m: f64,
+    hidden: f32,
     width: u32,
     height: u32,
     licence: &'static str,
@@ -36,8 +38,32 @@ struct Lens {
     coeffs: [f64; 8],
 }
 
+/// Makes the refiner `fill` of the daemon, for the holes of measured depth, so that a network learns on what it gets
+/// live. Every hole is filled.
+pub(super) fn fill() -> Result<FillRefiner> {
+    let made = FillRefiner::new(1).map(|fill| fill.with_reach(1.0));
+    made.map_err(|e| Error::new(ErrorKind::Io, e.to_string()).with_source(e))
+}
+
+/// Measured depth without holes, in the same unit; without any depth it stays empty.
+fn filled(s: &Triplet, settings: &Settings, fill: &mut FillRefiner) -> Result<Vec<u16>> {
+    let width = settings.width as usize;
+    let height = settings.height as usize;
+    let mut pixels = vec![0; s.raw.len()];
+    let unit_m = s.raw_unit_m;
+    let mut job = Job {
+        color: Color { pixels: &s.color, format: ColorFormat::Rgb8, width, height, stride: 3 * width },
+        depth: RawDepth { pixels: &s.raw, unit_m },
+        out: Output::Units { pixels: &mut pixels, unit_m },
+        steps: StepTimes::default(),
+    };
+    fill.refine(core::slice::from_mut(&mut job))
+        .map_err(|e| Error::new(ErrorKind::BadInput, format!("sample {}: {e}", s.number)).with_source(e))?;
+    Ok(pixels)
+}
+
 /// The files of a sample, the record last.
-pub(super) fn members(s: &Triplet, settings: &Settings) -> Result<Members> {
+pub(super) fn members(s: &Triplet, settings: &Settings, fill: &mut FillRefiner) -> Result<Members> {
     let size = (settings.width, settings.height);
     let key = format!("{:010}", s.number);
     let gray16 = |v: &[u16]| png(bytemuck::cast_slice(v), size, ExtendedColorType::L16);
@@ -52,6 +78,7 @@ pub(super) fn members(s: &Triplet, settings: &Settings) -> Result<Members> {
         intrinsics: Lens { fx: k.fx, fy: k.fy, cx: k.cx, cy: k.cy, model: k.distortion(), coeffs: k.coeffs },
         truth_unit_m: TRUTH_UNIT_M,
         raw_unit_m: s.raw_unit_m,
+        hidden: s.hidden,
         width: size.0,
         height: size.1,
         licence: "MIT OR Apache-2.0",
@@ -62,6 +89,7 @@ pub(super) fn members(s: &Triplet, settings: &Settings) -> Result<Members> {
         (format!("{key}.color.png"), png(&s.color, size, ExtendedColorType::Rgb8)?),
         (format!("{key}.truth.png"), gray16(&s.truth)?),
         (format!("{key}.raw.png"), gray16(&s.raw)?),
+        (format!("{key}.filled.png"), gray16(&filled(s, settings, fill)?)?),
         (format!("{key}.material.png"), png(&s.material, size, ExtendedColorType::L8)?),
         (format!("{key}.json"), json),
     ])

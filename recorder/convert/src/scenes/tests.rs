@@ -53,10 +53,10 @@ fn a_shard_holds_its_samples_as_the_format_says() {
     let names: Vec<String> = files(dir.path()).into_keys().collect();
     assert_eq!(names, ["t-000000.tar", "t-000001.tar", "t-000002.tar", "t.json"]);
     let members = untar(&dir.path().join("t-000001.tar"));
-    assert_eq!(members.len(), 15);
+    assert_eq!(members.len(), 18);
     for (i, (name, content)) in members.iter().enumerate() {
-        let kind = ["color.png", "truth.png", "raw.png", "material.png", "json"][i % 5];
-        let number = 3 + i as u64 / 5;
+        let kind = ["color.png", "truth.png", "raw.png", "filled.png", "material.png", "json"][i % 6];
+        let number = 3 + i as u64 / 6;
         assert_eq!(*name, format!("{number:010}.{kind}"));
         let made = generator().sample(number).unwrap();
         if kind == "json" {
@@ -76,6 +76,7 @@ fn a_shard_holds_its_samples_as_the_format_says() {
                 "intrinsics",
                 "truth_unit_m",
                 "raw_unit_m",
+                "hidden",
                 "width",
                 "height",
                 "licence",
@@ -92,6 +93,7 @@ fn a_shard_holds_its_samples_as_the_format_says() {
             "color.png" => assert_eq!(image.as_rgb8().unwrap().as_raw(), &made.color),
             "truth.png" => assert_eq!(image.as_luma16().unwrap().as_raw(), &made.truth),
             "raw.png" => assert_eq!(image.as_luma16().unwrap().as_raw(), &made.raw),
+            "filled.png" => assert_eq!(image.as_luma16().unwrap().as_raw(), &by_fill(&made)),
             _ => assert_eq!(image.as_luma8().unwrap().as_raw(), &made.material),
         }
     }
@@ -183,4 +185,44 @@ impl Tar {
         let mut out = tar::Tar::new(full);
         Error::io("write", Path::new("x.tar"), out.append("a", &[1; 4096]).unwrap_err())
     }
+}
+
+/// Measured depth as the refiner of the daemon fills it, every hole.
+fn by_fill(s: &depthrig_sim::synthetic::scenes::Triplet) -> Vec<u16> {
+    use depthrig_cdm::{Color, ColorFormat, FillRefiner, Job, Output, RawDepth, Refiner, StepTimes};
+    let mut out = vec![0; s.raw.len()];
+    let mut jobs = [Job {
+        color: Color { pixels: &s.color, format: ColorFormat::Rgb8, width: 64, height: 48, stride: 192 },
+        depth: RawDepth { pixels: &s.raw, unit_m: s.raw_unit_m },
+        out: Output::Units { pixels: &mut out, unit_m: s.raw_unit_m },
+        steps: StepTimes::default(),
+    }];
+    FillRefiner::new(1).unwrap().with_reach(1.0).refine(&mut jobs).unwrap();
+    assert!(out.iter().all(|z| *z > 0), "every hole is filled");
+    out
+}
+
+#[test]
+fn hidden_regions_are_holes_before_they_are_filled_and_the_record_has_their_share() {
+    let settings = |hide| Settings { seed: 3, width: 64, height: 48, hide, ..Settings::default() };
+    let plain = Generator::new(settings(0.0)).unwrap();
+    let hiding = Generator::new(settings(0.6)).unwrap();
+    let mut fill = sample::fill().unwrap();
+    let mut hidden = 0;
+    for number in 0..40 {
+        let before = plain.sample(number).unwrap();
+        let s = hiding.sample(number).unwrap();
+        let members = sample::members(&s, hiding.settings(), &mut fill).unwrap();
+        let member = |kind: &str| &members.iter().find(|(name, _)| name.ends_with(kind)).unwrap().1;
+        let v: serde_json::Value = serde_json::from_slice(member("json")).unwrap();
+        let count = |raw: &[u16]| raw.iter().filter(|z| **z > 0).count() as f64;
+        let share = 1.0 - count(&s.raw) / count(&before.raw);
+        assert!((v["hidden"].as_f64().unwrap() - share).abs() < 1e-4, "sample {number}: {share}");
+        let filled = image::load_from_memory(member("filled.png")).unwrap();
+        assert_eq!(filled.as_luma16().unwrap().as_raw(), &by_fill(&s));
+        assert!((&before.color, &before.truth) == (&s.color, &s.truth));
+        hidden += u32::from(share > 0.0);
+    }
+    assert!((15..=33).contains(&hidden), "{hidden} of 40");
+    assert!(Generator::new(settings(1.5)).unwrap_err().to_string().contains("0..=1"));
 }

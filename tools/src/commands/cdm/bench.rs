@@ -3,6 +3,8 @@
 //! Each combination of engine and size runs in its own process: a process can load one ONNX Runtime only, peak memory
 //! is measured per process, and a failure does not end the other measurements.
 
+use self::flicker::Flicker;
+use self::scene::image;
 use super::run::{engine as parse_engine, precision as parse_precision};
 use super::store::{Models, usage};
 use crate::bench::stats::median;
@@ -11,34 +13,43 @@ use crate::out;
 use anyhow::{Context as _, Result};
 use depthrig_bus::clock::{HostTime, process_cpu_ns};
 use depthrig_cdm::{
-    Color, ColorFormat, EngineKind, Job, Output, Precision, RawDepth, RefinerOptions, StepTimes, refiner,
+    Color, ColorFormat, EngineKind, Job, Output, Precision, RawDepth, RefinerOptions, StepTimes,
+    find_library, refiner,
 };
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 use std::process::{Command, Stdio};
+
+mod flicker;
+mod scene;
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
 The image is synthetic, with edges and holes; times do not depend on its content. Times are medians of wall-clock and
 CPU time (all threads). A busy computer affects wall-clock time more than CPU time.
 
-An engine is fill, or onnxruntime with a device and a precision: onnxruntime/cpu/fp32,
+--flicker N refines N images of a still scene with the noise of a stereo camera (a tenth of a pixel) and prints how much depth
+changes from image to image: the standard deviation of raw and refined depth where all of them have raw depth, and of
+refined depth in the holes.
+
+An engine is fill, tiny, or onnxruntime with a device and a precision: onnxruntime/cpu/fp32,
 onnxruntime/openvino/bf16, onnxruntime/cuda:0/fp16.
 
 Exit codes: 0 success, 1 an engine failed, 2 wrong usage.
 
 Examples:
   depthrig cdm bench
+  depthrig cdm bench --image 640x480 --threads 1 --flicker 30
   depthrig cdm bench --model cdm-d435 --input-size 252,518
   depthrig cdm bench --model cdm-d435 --engine onnxruntime/cpu/fp32,onnxruntime/openvino/bf16 --threads 2 --json";
 
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct BenchArgs {
-    /// Installed model, or checkpoint file; without one, only fill can run
+    /// Installed model, or checkpoint file; without one, only fill and tiny can run
     #[arg(long, value_name = "NAME|FILE")]
     model: Option<String>,
-    /// Engines, as ENGINE[/DEVICE[/PRECISION]] [default: fill, onnxruntime]
+    /// Engines, as ENGINE[/DEVICE[/PRECISION]] [default: fill, tiny, onnxruntime]
     #[arg(long = "engine", value_name = "ENGINE", value_delimiter = ',', value_parser = Spec::parse)]
     engines: Vec<Spec>,
     /// Size of the image, pixels
@@ -56,6 +67,9 @@ pub struct BenchArgs {
     /// Measurement time of each, seconds; at least three runs
     #[arg(long, value_name = "SECONDS", default_value_t = 5.0, value_parser = crate::args::seconds)]
     seconds: f64,
+    /// Measure the noise of refined depth over N images, too
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(2..=1000))]
+    flicker: Option<u32>,
     /// ONNX Runtime library [default: found automatically]
     #[arg(long, value_name = "FILE")]
     library: Option<PathBuf>,
@@ -99,8 +113,9 @@ impl Spec {
 
     fn text(&self) -> String {
         match self.engine {
-            EngineKind::OnnxRuntime => format!("{}/{}/{}", self.engine, self.device, self.precision),
             EngineKind::Fill => EngineKind::Fill.to_string(),
+            EngineKind::Tiny if *self == Self::of(EngineKind::Tiny) => EngineKind::Tiny.to_string(),
+            _ => format!("{}/{}/{}", self.engine, self.device, self.precision),
         }
     }
 }
@@ -138,6 +153,8 @@ struct Measured {
     cpu_ms: f64,
     images_per_s: f64,
     peak_mb: f64,
+    /// Only with `--flicker`.
+    flicker: Option<Flicker>,
     /// Failure, instead of numbers.
     error: Option<String>,
 }
@@ -152,6 +169,10 @@ pub fn run(args: &BenchArgs) -> Result<Exit> {
     let mut specs = args.engines.clone();
     if specs.is_empty() {
         specs.push(Spec::of(EngineKind::Fill));
+        match find_library(args.library.as_deref(), "cpu", Precision::Fp32) {
+            Ok(_) => specs.push(Spec::of(EngineKind::Tiny)),
+            Err(e) => out::note(format_args!("tiny is left out: {e}")),
+        }
         specs.extend(args.model.is_some().then(|| Spec::of(EngineKind::OnnxRuntime)));
     }
     if let Some(spec) = specs.iter().find(|s| s.engine.needs_model() && args.model.is_none()) {
@@ -192,6 +213,7 @@ fn measure_in_child(args: &BenchArgs, spec: &Spec, input_size: Option<u32>) -> R
     option("--model", args.model.as_ref().filter(|_| spec.engine.needs_model()).map(AsRef::as_ref));
     option("--library", args.library.as_ref().map(AsRef::as_ref));
     option("--models", args.models.dir.as_ref().map(AsRef::as_ref));
+    option("--flicker", args.flicker.map(|n| n.to_string()).as_ref().map(AsRef::as_ref));
     option("--input-size", input_size.map(|s| s.to_string()).as_ref().map(AsRef::as_ref));
     let done =
         command.stdin(Stdio::null()).output().context("a process for the measurement cannot be started")?;
@@ -271,6 +293,9 @@ fn measure(args: &BenchArgs, spec: &Spec) -> Result<Measured> {
         }
     }
     let [prepare_ms, infer_ms, finish_ms, total_ms, cpu_ms] = times.each_ref().map(|t| median(t));
+    let peak_mb = peak_mb().unwrap_or(0.0);
+    let flicker = args.flicker.map(|images| flicker::measure(&mut *refiner, args.image, images));
+    let flicker = flicker.transpose().map_err(usage)?;
     let described = refiner.describe();
     Ok(Measured {
         asked: spec.text(),
@@ -289,7 +314,8 @@ fn measure(args: &BenchArgs, spec: &Spec) -> Result<Measured> {
         best_ms: times[3].iter().copied().fold(f64::INFINITY, f64::min),
         cpu_ms,
         images_per_s: 1000.0 / total_ms,
-        peak_mb: peak_mb().unwrap_or(0.0),
+        peak_mb,
+        flicker,
         error: None,
     })
 }
@@ -303,29 +329,6 @@ fn peak_mb() -> Option<f64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find(|l| l.starts_with("VmHWM:"))?;
     Some(line.split_whitespace().nth(1)?.parse::<f64>().ok()? / 1024.0)
-}
-
-/// A synthetic image: depth in millimetres of boxes on a slanted floor with holes along their edges, and matching
-/// colour.
-fn image(width: usize, height: usize) -> (Vec<u8>, Vec<u16>) {
-    let mut color = Vec::with_capacity(3 * width * height);
-    let mut depth = Vec::with_capacity(width * height);
-    for v in 0..height {
-        for u in 0..width {
-            let x = u as f64 / width as f64;
-            let y = v as f64 / height as f64;
-            let bx = (x * 5.0).fract();
-            let by = (y * 4.0).fract();
-            let inside = bx > 0.25 && bx < 0.75 && by > 0.25 && by < 0.75;
-            let near_edge = (bx - 0.25).abs() < 0.04 || (bx - 0.75).abs() < 0.03;
-            let floor = 2200.0 - 1200.0 * y + 90.0 * (9.0 * x).sin();
-            let d = if inside { floor * 0.8 } else { floor };
-            depth.push(if near_edge && by > 0.2 && by < 0.8 { 0 } else { d as u16 });
-            let shade = if inside { 190.0 } else { 90.0 } + 30.0 * (40.0 * x).sin() * (31.0 * y).cos();
-            color.extend([shade as u8, (shade * 0.8) as u8, (255.0 - shade) as u8]);
-        }
-    }
-    (color, depth)
 }
 
 fn print_rows(rows: &[Measured]) -> Result<()> {
@@ -361,6 +364,15 @@ fn print_rows(rows: &[Measured]) -> Result<()> {
     if rows.iter().any(|r| r.error.is_none()) {
         out::line(out::table(&header, 1, good))?;
     }
+    let flickers = rows.iter().filter_map(|r| Some((r, r.flicker.as_ref()?))).map(|(r, f)| {
+        let mm = |mm: f64| format!("{mm:.2}");
+        vec![r.engine.clone(), f.images.to_string(), mm(f.raw_mm), mm(f.refined_mm), mm(f.holes_mm)]
+    });
+    let flickers: Vec<_> = flickers.collect();
+    if !flickers.is_empty() {
+        out::line("")?;
+        out::line(out::table(&["ENGINE", "IMAGES", "RAW mm", "REFINED mm", "HOLES mm"], 1, flickers))?;
+    }
     for row in rows {
         if let Some(error) = &row.error {
             out::line(format_args!("{}: {error}", row.asked))?;
@@ -380,7 +392,8 @@ mod tests {
             (spec.engine, &*spec.device, spec.precision),
             (EngineKind::OnnxRuntime, "cuda:0", Precision::Fp16)
         );
-        for text in ["fill", "onnxruntime/cpu/fp32", "onnxruntime/openvino/bf16"] {
+        for text in ["fill", "tiny", "tiny/cuda:0/fp32", "onnxruntime/cpu/fp32", "onnxruntime/openvino/bf16"]
+        {
             assert_eq!(Spec::parse(text).unwrap().text(), text);
         }
         assert_eq!(Spec::parse("onnxruntime").unwrap().text(), "onnxruntime/cpu/fp32");
@@ -390,11 +403,7 @@ mod tests {
     }
 
     #[test]
-    fn the_image_has_holes_and_depth() {
-        let (color, depth) = image(160, 90);
-        assert_eq!((color.len(), depth.len()), (3 * 160 * 90, 160 * 90));
-        let holes = depth.iter().filter(|d| **d == 0).count();
-        assert!(holes > 100 && holes < depth.len() / 3, "{holes}");
+    fn sizes_by_their_words() {
         assert!(size("640x480") == Ok((640, 480)) && size("640").is_err() && size("0x5").is_err());
     }
 

@@ -7,7 +7,7 @@ use crate::{image_file, out};
 use anyhow::Result;
 use depthrig_cdm::{
     Color, ColorFormat, EngineKind, FillRefiner, Job, Output, Precision, RawDepth, RefinerOptions, StepTimes,
-    refiner,
+    refiner, tiny,
 };
 use image::{DynamicImage, ExtendedColorType, ImageEncoder, codecs::png};
 use serde::Serialize;
@@ -26,6 +26,7 @@ Examples:
   depthrig cdm run --rgb color.png --depth depth.png --depth-unit 0.001 --model cdm-d435 --out refined.npy
   depthrig cdm run --rgb color.png --depth depth.png --depth-unit 0.0001 --model cdm_d405.ckpt --input-size 252 \\
       --inverse --out inverse.npy
+  depthrig cdm run --rgb color.png --depth depth.png --depth-unit 0.001 --engine tiny --out refined.png
   depthrig cdm run --rgb color.png --depth depth.png --depth-unit 0.001 --engine fill --out filled.png";
 
 /// Arguments.
@@ -40,13 +41,13 @@ pub struct RunArgs {
     /// Metres per unit of the raw depth
     #[arg(long, value_name = "METRES", value_parser = crate::args::depth_unit_m)]
     depth_unit: f64,
-    /// Installed model, or checkpoint file
+    /// Installed model, checkpoint file, or NAME.onnx for the engine tiny
     #[arg(long, value_name = "NAME|FILE", required_unless_present = "engine")]
     model: Option<String>,
     /// Shorter side of the network's input, pixels [default: the model's]
     #[arg(long, value_name = "PIXELS", value_parser = clap::value_parser!(u32).range(14..=8192))]
     input_size: Option<u32>,
-    /// Engine: onnxruntime, or fill (needs no model) [default: onnxruntime]
+    /// Engine: onnxruntime, or tiny or fill, which need no model [default: onnxruntime]
     #[arg(long, value_name = "ENGINE", value_parser = engine)]
     engine: Option<EngineKind>,
     /// Write the network's output: inverse depth, 1/m
@@ -78,7 +79,7 @@ pub struct RunArgs {
     /// ONNX Runtime library [default: found automatically]
     #[arg(long, value_name = "FILE")]
     library: Option<PathBuf>,
-    /// Reach of fill from measured depth, fraction of the width; 1: no limit
+    /// Reach of fill and tiny from measured depth, fraction of the width; 1: no limit
     #[arg(long, value_name = "PART", value_parser = crate::args::fill_reach, default_value_t = FillRefiner::REACH)]
     fill_reach: f64,
     #[command(flatten)]
@@ -146,7 +147,12 @@ pub fn run(args: &RunArgs) -> Result<Exit> {
     let depth = read_depth(&args.depth, &args.rgb, width, height)?;
     let options = options(args)?;
     let max_depth_m = options.model.as_ref().map_or(f64::INFINITY, |m| m.max_depth_m);
-    let trained = options.model.as_ref().map(depthrig_cdm::Model::is_trained);
+    let has_model = options.model.is_some();
+    let trained = match &options.model {
+        Some(model) => Some(model.is_trained()),
+        None => (options.engine_kind() == EngineKind::Tiny)
+            .then(|| options.tiny.is_some() || tiny::model().is_trained),
+    };
     let mut refiner = refiner(&options).map_err(usage)?;
     let mut refined =
         if as_png { Refined::Units(vec![0; depth.len()]) } else { Refined::Floats(vec![0.0; depth.len()]) };
@@ -164,14 +170,15 @@ pub fn run(args: &RunArgs) -> Result<Exit> {
     let steps = job.steps;
     out.write(&encoded(&refined, width, height)?)?;
     let described = refiner.describe();
-    let limit_m = (!described.model.is_empty()).then(|| args.max_depth.unwrap_or(max_depth_m));
+    let limit_m = has_model.then(|| args.max_depth.unwrap_or(max_depth_m));
     let input = InputDepth::of(&depth, args.depth_unit, limit_m);
     let share = |n: usize| 100.0 * n as f64 / depth.len() as f64;
     let seen = match &refined {
         Refined::Units(p) => p.iter().filter(|d| **d > 0).count(),
         Refined::Floats(p) => p.iter().filter(|d| d.is_finite() && **d > 0.0).count(),
     };
-    let suspicions = if described.model.is_empty() || input.usable == 0 {
+    // Of the others much may be unknown, beyond the reach of filling.
+    let suspicions = if !has_model || input.usable == 0 {
         Vec::new()
     } else {
         Plausibility::of(&metres(&refined, args), &depth, &input).warnings()
@@ -362,8 +369,12 @@ fn form(args: &RunArgs) -> Result<bool> {
 }
 
 fn options(args: &RunArgs) -> Result<RefinerOptions> {
+    let file = args.model.as_deref().map(Path::new).filter(|path| tiny::is_tiny_file(path));
+    let engine = args.engine.or_else(|| file.map(|_| EngineKind::Tiny));
+    let is_tiny = engine == Some(EngineKind::Tiny);
+    let tiny = file.filter(|_| is_tiny).map(tiny::TinyFile::read).transpose().map_err(usage)?;
     let model = match &args.model {
-        Some(_) if args.engine == Some(EngineKind::Fill) => None, // it needs none
+        Some(_) if engine.is_some_and(|e| !e.needs_model()) => None,
         Some(name) => {
             let mut model = args.models.store()?.model(name).map_err(usage)?;
             if let Some(order) = args.channel_order {
@@ -377,8 +388,9 @@ fn options(args: &RunArgs) -> Result<RefinerOptions> {
         None => None,
     };
     Ok(RefinerOptions {
-        engine: args.engine,
+        engine,
         model,
+        tiny,
         input_size: args.input_size,
         precision: args.precision,
         device: args.device.clone(),

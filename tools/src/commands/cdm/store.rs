@@ -9,7 +9,7 @@ use anyhow::Result;
 use clap::ValueEnum;
 use core::ops::ControlFlow;
 use depthrig_cdm::store::{Import, Installed, Record, Source, check_name};
-use depthrig_cdm::{ChannelOrder, Encoder, ErrorKind, ModelStore, Weights, published, weights};
+use depthrig_cdm::{ChannelOrder, Encoder, ErrorKind, ModelStore, Weights, published, tiny, weights};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
@@ -38,6 +38,7 @@ Exit codes: 0 success, 1 the model is missing or damaged, 2 wrong usage.
 
 Examples:
   depthrig cdm info cdm-d435
+  depthrig cdm info tiny                 the network that is part of the program: its record
   depthrig cdm info cdm-d435 --check     verify every byte";
 
 /// Selects the model folder.
@@ -198,6 +199,28 @@ impl<'a> ModelReport<'a> {
     }
 }
 
+/// The network of the program, as JSON.
+#[derive(Serialize)]
+struct BuiltIn {
+    name: &'static str,
+    id: &'static str,
+    sha256: &'static str,
+    bytes: u64,
+    trained: bool,
+    /// Whether `engine = "auto"` may choose it.
+    default: bool,
+}
+
+impl BuiltIn {
+    fn get() -> Self {
+        let tiny::TinyModel { id, sha256, bytes, is_trained, is_default } = tiny::model();
+        Self { name: TINY, id, sha256, bytes: *bytes, trained: *is_trained, default: *is_default }
+    }
+}
+
+/// The name of the engine whose network is part of the program.
+const TINY: &str = depthrig_cdm::EngineKind::Tiny.name();
+
 /// A rejected checkpoint, as JSON.
 #[derive(Serialize)]
 struct Rejected<'a> {
@@ -295,24 +318,33 @@ pub fn list(args: &ListArgs) -> Result<Exit> {
             .iter()
             .filter_map(|(name, m)| Some(Damaged { name, error: m.as_ref().err()?.to_string() }));
         let bad: Vec<_> = bad.collect();
-        out::json(&serde_json::json!({ "folder": store.dir(), "models": good, "damaged": bad }))?;
-    } else if models.is_empty() {
-        out::line(format_args!(
-            "no model is installed in {}; `depthrig cdm list --published` lists the models to fetch",
-            store.dir().display()
-        ))?;
+        let built_in = [BuiltIn::get()];
+        let folder = store.dir();
+        let all =
+            serde_json::json!({ "folder": folder, "models": good, "damaged": bad, "built_in": built_in });
+        out::json(&all)?;
     } else {
+        if models.is_empty() {
+            out::line(format_args!(
+                "no model is installed in {}; `depthrig cdm list --published` lists the models to fetch",
+                store.dir().display()
+            ))?;
+        }
         let rows = models.iter().map(|(name, model)| match model {
             Ok(m) => row(m),
             Err(e) => vec![name.clone(), format!("damaged: {e}")],
         });
-        out::line(out::table(
-            &["model", "encoder", "trained", "cameras", "installed", "input", "size"],
-            5,
-            rows,
-        ))?;
+        let header = ["model", "encoder", "trained", "cameras", "installed", "input", "size"];
+        out::line(out::table(&header, 5, rows.chain([built_in_row()])))?;
     }
     Ok(if damaged { Exit::Failed } else { Exit::Good })
+}
+
+fn built_in_row() -> Vec<String> {
+    let tiny = BuiltIn::get();
+    let trained = if tiny.trained { "yes" } else { "NO" };
+    let words = [TINY, "-", trained, "any", "in the program", "-"];
+    words.map(str::to_owned).into_iter().chain([out::bytes(tiny.bytes)]).collect()
 }
 
 fn row(m: &Installed) -> Vec<String> {
@@ -359,7 +391,11 @@ fn list_published(json: bool) -> Result<Exit> {
 /// Prints the record of a model.
 pub fn info(args: &InfoArgs) -> Result<Exit> {
     let store = args.models.store()?;
-    let model = store.info(&args.name).map_err(usage)?;
+    let model = match store.info(&args.name) {
+        // An installed model of the same name comes first.
+        Err(e) if e.kind() == ErrorKind::NotFound && args.name == TINY => return built_in_info(args.json),
+        other => other.map_err(usage)?,
+    };
     if args.check {
         store.check(&args.name)?;
     }
@@ -371,6 +407,28 @@ pub fn info(args: &InfoArgs) -> Result<Exit> {
         if args.check {
             out::line("  checked       every byte is as it was installed, every number is finite")?;
         }
+    }
+    Ok(Exit::Good)
+}
+
+/// Prints the record of the network that is part of the program.
+fn built_in_info(json: bool) -> Result<Exit> {
+    let tiny = BuiltIn::get();
+    if json {
+        out::json(
+            &serde_json::json!({ "built_in": tiny, "record": toml::from_str::<toml::Table>(tiny::RECORD)? }),
+        )?;
+        return Ok(Exit::Good);
+    }
+    let auto = if tiny.default { "may choose it" } else { "does not choose it" };
+    out::line(format_args!(
+        "{}  in the program, {}; engine = \"auto\" {auto}",
+        tiny.id,
+        out::bytes(tiny.bytes)
+    ))?;
+    out::line(tiny::RECORD.trim_end())?;
+    if !tiny.trained {
+        out::line("NOT TRAINED: random weights")?;
     }
     Ok(Exit::Good)
 }

@@ -17,6 +17,8 @@ CHANNELS = 6
 """Colour, filled and raw inverse depth divided by the mean of the filled one, 1 where raw depth was measured."""
 MULTIPLE = 16
 """Sides of an input are multiples of this."""
+DILATIONS = ((1,), (1, 1), (1, 2, 1), (1, 2, 4, 1))
+"""Of the blocks of each stage on the way down: holes are often larger than what plain blocks see."""
 REACH = 2.0
 """The largest |r|."""
 
@@ -40,12 +42,12 @@ def _norm(channels: int) -> nn.GroupNorm:
 class _Inverted(nn.Module):
     """Inverted residual (MobileNetV2): wider, by depth, narrower again."""
 
-    def __init__(self, channels: int, expand: int = 3):
+    def __init__(self, channels: int, dilation: int = 1, expand: int = 3):
         super().__init__()
         wide = expand * channels
         self.widen = nn.Conv2d(channels, wide, 1, bias=False)
         self.norm1 = _norm(wide)
-        self.each = nn.Conv2d(wide, wide, 3, padding=1, groups=wide, bias=False)
+        self.each = nn.Conv2d(wide, wide, 3, padding=dilation, dilation=dilation, groups=wide, bias=False)
         self.norm2 = _norm(wide)
         self.narrow = nn.Conv2d(wide, channels, 1, bias=False)
         self.norm3 = _norm(channels)
@@ -56,8 +58,8 @@ class _Inverted(nn.Module):
         return x + self.norm3(self.narrow(y))
 
 
-def _stage(channels: int, blocks: int) -> nn.Sequential:
-    return nn.Sequential(*(_Inverted(channels) for _ in range(blocks)))
+def _stage(channels: int, dilations: tuple[int, ...]) -> nn.Sequential:
+    return nn.Sequential(*(_Inverted(channels, d) for d in dilations))
 
 
 class Tiny(nn.Module):
@@ -70,10 +72,10 @@ class Tiny(nn.Module):
         super().__init__()
         widths = (width, width * 3 // 2 // 8 * 8, 2 * width, 3 * width)
         self.apart = nn.Conv2d(CHANNELS, widths[0], 2, 2)
-        self.encode = nn.ModuleList(_stage(w, n) for w, n in zip(widths, (1, 2, 3, 4), strict=True))
+        self.encode = nn.ModuleList(_stage(w, n) for w, n in zip(widths, DILATIONS, strict=True))
         self.down = nn.ModuleList(nn.Conv2d(a, b, 2, 2) for a, b in zip(widths, widths[1:], strict=False))
         self.up = nn.ModuleList(nn.ConvTranspose2d(b, a, 2, 2) for a, b in zip(widths, widths[1:], strict=False))
-        self.decode = nn.ModuleList(_stage(w, n) for w, n in zip(widths, (1, 1, 2), strict=False))
+        self.decode = nn.ModuleList(_stage(w, n) for w, n in zip(widths, ((1,), (1,), (1, 1)), strict=False))
         self.together = nn.ConvTranspose2d(widths[0], 1, 2, 2)
         # It begins as the identity.
         nn.init.zeros_(self.together.weight)
