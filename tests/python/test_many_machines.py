@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import http.client
 import http.server
+import itertools
 import json
 import os
 import random
@@ -12,10 +14,11 @@ import sys
 import threading
 import time
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 from test_daemon import WAIT_S, binary, environment, running, runtime  # noqa: F401  (fixtures)
@@ -41,6 +44,7 @@ height = 120
 """
 COLOR = '[[camera.stream]]\nname = "color"\nwidth = 160\nheight = 120\n'
 SCENES = ["scenes", "--count", "12", "--per-shard", "2", "--size", "160x120", "--threads", "1"]
+FILES = 'rig = "lab"\n[[camera]]\nname = "cam"\nbackend = "files"\nmanifest = '
 KILLS = 6
 
 
@@ -61,8 +65,32 @@ def data(binary: str, runtime: Path, tmp_path_factory: pytest.TempPathFactory) -
     return record(binary, runtime, tmp_path_factory.mktemp("lab") / "one", RIG + COLOR).parent
 
 
+@pytest.fixture(scope="module")
+def noisy(binary: str, runtime: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: F811
+    """A folder with a dataset whose segment has more bytes than go in one request."""
+    folder = tmp_path_factory.mktemp("noisy")
+    images(folder, np.random.default_rng(1).integers(400, 4000, (480, 640), np.uint16))
+    return record(binary, runtime, folder / "one", FILES + json.dumps(str(folder))).parent
+
+
+def images(folder: Path, depth: np.ndarray) -> None:
+    """Write a camera without calibration that has a pair of images."""
+    color = np.stack([depth, depth >> 3, depth >> 5], axis=2).astype(np.uint8)
+    Image.fromarray(color).save(folder / "color_1.png")
+    Image.fromarray(depth).save(folder / "depth_1.png")
+    manifest = 'model = "M"\nrate_hz = 10.0\n[[stream]]\nname = "color"\nfiles = "color_*.png"\n'
+    manifest += '[[stream]]\nname = "depth"\nfiles = "depth_*.png"\ndepth_unit_m = 0.001\n'
+    (folder / "camera.toml").write_text(manifest)
+
+
 def files(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+    """All files but the hidden ones, of which a killed process may leave one; folders have no content."""
+    there = [p for p in sorted(folder.rglob("*")) if not p.name.startswith(".")]
+    return {str(p.relative_to(folder)): p.read_bytes() if p.is_file() else b"" for p in there}
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {name: content for name, content in files(folder).items() if (folder / name).is_file()}
 
 
 def code(binary: str, *arguments: str, env: dict[str, str] | None = None) -> tuple[int, str, str]:  # noqa: F811
@@ -113,7 +141,7 @@ def test_killed_workers_lose_and_double_nothing(
     binary: str, data: Path, tmp_path: Path, what: str  # noqa: F811
 ) -> None:
     command = SCENES if what == "scenes" else ["cdm", "relabel", str(data), "--engine", "fill", "-j", "1"]
-    assert code(binary, *command, "--out", str(tmp_path / "calm"))[0] == 0
+    assert code(binary, *command, "--out", str(tmp_path / "calm"), "--shard", "0/1")[0] == 0
     out = tmp_path / "disturbed"
     with killing(binary, seed=3) as killed:
         # Every kill may hit the same part.
@@ -201,7 +229,8 @@ def upload(address: str, folder: Path, prefix: str) -> None:
 
     keys = {"aws_access_key_id": "test", "aws_secret_access_key": "test", "region_name": "us-east-1"}
     client = boto3.client("s3", endpoint_url=address, **keys)
-    for name, content in files(folder).items():
+    for name in (p.relative_to(folder) for p in folder.rglob("*") if p.is_file()):
+        content = (folder / name).read_bytes()
         client.put_object(Bucket="lab", Key=f"{prefix}/{name}", Body=content)
 
 
@@ -220,7 +249,7 @@ def test_a_bucket_gets_what_a_folder_gets(binary: str, data: Path, tmp_path: Pat
         outs = ["--out", f"s3://lab/{name}", "--json"]
         done = [code(binary, *command, *remote, *outs, "--shard", f"{k}/2", env=env) for k in (0, 1)]
         assert [d[0] for d in done] == [0, 0], done
-        assert objects(server, name) == files(here)
+        assert objects(server, name) == contents(here)
         # Again: all of it is there.
         again, said, _ = code(binary, *command, *remote, *outs, "--shard", "0/1", env=env)
         report = json.loads(said)
@@ -230,18 +259,6 @@ def test_a_bucket_gets_what_a_folder_gets(binary: str, data: Path, tmp_path: Pat
         refused, _, why = code(binary, *command, *other, *remote, *outs, "--shard", "0/1", env=env)
         assert (refused, "other arguments" in why) == (2, True), why
     assert not list(tmp_path.glob("depthrig-*")), "copies are removed"
-
-
-def test_two_workers_of_one_part_double_nothing(binary: str, tmp_path: Path, server: str) -> None:  # noqa: F811
-    """Shards of more than one request, which go in parts."""
-    command = ["scenes", "--count", "24", "--per-shard", "24", "--size", "1280x720", "--name", "big"]
-    assert code(binary, *command, "--out", str(tmp_path / "here"))[0] == 0
-    (shard,) = (tmp_path / "here").glob("*.tar")
-    assert shard.stat().st_size > 16 << 20
-    with_s3 = [binary, *command, "--out", "s3://lab/twice"]
-    both = [subprocess.Popen(with_s3, env=cloud(server), stdout=subprocess.DEVNULL) for _ in range(2)]
-    assert [p.wait(WAIT_S * 4) for p in both] == [0, 0]
-    assert objects(server, "twice") == files(tmp_path / "here")
 
 
 def test_errors_of_a_bucket_are_clear(binary: str, data: Path, tmp_path: Path, server: str) -> None:  # noqa: F811
@@ -304,62 +321,129 @@ def answering(status: int, body: bytes, length: int | None = None) -> Iterator[t
             server.shutdown()
 
 
-def test_a_connection_lost_in_the_middle_is_asked_again(
+def test_an_answer_lost_in_the_middle_is_asked_for_again(
     binary: str, data: Path, tmp_path: Path, server: str  # noqa: F811
 ) -> None:
     upload(server, data, "lossy")
-    assert code(binary, "cdm", "relabel", str(data), "--out", str(tmp_path / "here"), "--shard", "0/1")[0] == 0
-    with losing(server, every=4) as (address, lost):
-        arguments = ["cdm", "relabel", "s3://lab/lossy", "--out", "s3://lab/lossy-out"]
-        ended, _, why = code(binary, *arguments, env=cloud(address))
+    arguments = ["cdm", "relabel", "--engine", "fill", "--shard", "0/1", "--out"]
+    assert code(binary, *arguments, str(tmp_path / "here"), str(data))[0] == 0
+    count = itertools.count(1)
+    with proxy(server, lambda *_: "" if next(count) % 4 else "lose") as (address, lost):
+        ended, _, why = code(binary, *arguments, "s3://lab/lossy-out", "s3://lab/lossy", env=cloud(address))
     assert ended == 0, why
-    assert lost, "no connection was lost"
-    assert objects(server, "lossy-out") == files(tmp_path / "here")
+    assert {request.split()[0] for request in lost} >= {"GET", "PUT"}, lost
+    assert objects(server, "lossy-out") == contents(tmp_path / "here")
+
+
+def test_large_segments_go_in_parts_and_are_there_once(
+    binary: str, noisy: Path, tmp_path: Path, server: str  # noqa: F811
+) -> None:
+    upload(server, noisy, "noisy")
+    arguments = ["cdm", "relabel", "--engine", "fill", "--is-aligned", "--shard", "0/1"]
+    ended, _, why = code(binary, *arguments, str(noisy), "--out", str(tmp_path / "here"))
+    assert ended == 0, why
+    want = contents(tmp_path / "here")
+    assert max(map(len, want.values())) > 16 << 20
+    # Two that do the same work at once.
+    command = [binary, *arguments, "s3://lab/noisy", "--out", "s3://lab/twice"]
+    both = [subprocess.Popen(command, env=cloud(server), stdout=subprocess.DEVNULL) for _ in range(2)]
+    assert [p.wait(WAIT_S * 4) for p in both] == [0, 0]
+    assert objects(server, "twice") == want
+    # The upload is complete, and the answer that says so is lost: the server knows of no such upload any more.
+    seen: list[str] = []
+
+    def lose(method: str, path: str) -> str:
+        is_end = method == "POST" and "uploadId=" in path
+        seen.extend([path] if is_end else [])
+        return "lose" if is_end and len(seen) == 1 else ""
+
+    with proxy(server, lose) as (address, lost):
+        ended, _, why = code(binary, *arguments, str(noisy), "--out", "s3://lab/ends", env=cloud(address))
+    assert ended == 0, why
+    assert len(lost) == 1 and len(seen) >= 2, seen
+    assert objects(server, "ends") == want
+    # A part is lost for good: the next run makes the rest.
+    with proxy(server, lambda _, path: "lose" if "partNumber=2" in path else "") as (address, _):
+        ended, _, why = code(binary, *arguments, str(noisy), "--out", "s3://lab/torn", env=cloud(address))
+    assert (ended, "does not answer" in why) == (1, True), why
+    assert not [name for name in objects(server, "torn") if name != "relabel.json"]
+    assert code(binary, *arguments, str(noisy), "--out", "s3://lab/torn", env=cloud(server))[0] == 0
+    assert objects(server, "torn") == want
+
+
+def test_what_others_put_is_never_taken_for_ones_own(
+    binary: str, data: Path, tmp_path: Path, server: str  # noqa: F811
+) -> None:
+    arguments = [binary, "cdm", "relabel", "--engine", "fill", "--shard", "0/1", str(data), "--out"]
+    # Requests that are in each other's way: nothing is there yet.
+    tried: list[str] = []
+
+    def refuse(method: str, path: str) -> str:
+        tried.extend([path] if method == "PUT" else [])
+        return "409" if method == "PUT" and tried.count(path) == 1 else ""
+
+    assert code(*arguments, str(tmp_path / "here"))[0] == 0
+    with proxy(server, refuse) as (address, refused):
+        ended, _, why = code(*arguments, "s3://lab/busy", env=cloud(address))
+    assert ended == 0, why
+    assert refused
+    assert objects(server, "busy") == contents(tmp_path / "here")
+    (segment, *_) = (name for name in contents(tmp_path / "here") if name.endswith(".mcap"))
+    (tmp_path / "odd" / segment).parent.mkdir(parents=True)
+    (tmp_path / "odd" / segment).write_bytes(b"of another version")
+    upload(server, tmp_path / "odd", "odd")
+    ended, _, why = code(*arguments, "s3://lab/odd", env=cloud(server))
+    assert (ended, f"s3://lab/odd/{segment} has 18 bytes instead of" in why) == (1, True), why
+    assert not [name for name in objects(server, "odd") if name == f"{Path(segment).parent}/account.json"]
 
 
 @contextmanager
-def losing(server: str, every: int) -> Iterator[tuple[str, list[int]]]:
-    """A proxy before a server that ends each n-th connection after some bytes of the answer; yields those it ended."""
-    host, port = server.removeprefix("http://").split(":")
-    listener = socket.create_server(("127.0.0.1", 0))
-    lost: list[int] = []
+def proxy(server: str, does: Callable[[str, str], str]) -> Iterator[tuple[str, list[str]]]:
+    """A proxy before a server, which asks `does(method, path)` what to do: nothing (""), lose the answer of what the server has
+    done ("lose"), or answer 409 itself ("409"). Yields its address and the requests that it spoiled."""
+    spoiled: list[str] = []
 
-    def pump(client: socket.socket, number: int) -> None:
-        with client, socket.create_connection((host, int(port))) as upstream:
+    class Handler(http.server.BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
 
-            def forward() -> None:
-                try:
-                    while more := client.recv(1 << 16):
-                        upstream.sendall(more)
-                except OSError:
-                    pass
-
-            threading.Thread(target=forward, daemon=True).start()
-            try:
-                while more := upstream.recv(1 << 16):
-                    if number % every == every - 1:
-                        client.sendall(more[:20])
-                        lost.append(number)
-                        return
-                    client.sendall(more)
-            except OSError:
-                pass
-
-    def serve() -> None:
-        number = 0
-        while True:
-            try:
-                client, _ = listener.accept()
-            except OSError:
+        def answer(self) -> None:
+            body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+            does_now = does(self.command, self.path)
+            if does_now:
+                spoiled.append(f"{self.command} {self.path}")
+            if does_now == "409":
+                self.send_response_only(409)
+                self.send_header("Content-Length", "0")
+                self.end_headers()
                 return
-            threading.Thread(target=pump, args=(client, number), daemon=True).start()
-            number += 1
+            upstream = http.client.HTTPConnection(server.removeprefix("http://"), timeout=WAIT_S)
+            upstream.request(self.command, self.path, body, dict(self.headers.items()))
+            answer = upstream.getresponse()
+            content = answer.read()
+            upstream.close()
+            if does_now == "lose":
+                self.wfile.write(b"HTTP/1.1 200 OK\r\nCont")
+                self.close_connection = True
+                return
+            self.send_response_only(answer.status)
+            for name, value in answer.headers.items():
+                if name.lower() not in ("connection", "transfer-encoding"):
+                    self.send_header(name, value)
+            self.end_headers()
+            self.wfile.write(content)
 
-    threading.Thread(target=serve, daemon=True).start()
-    try:
-        yield f"http://127.0.0.1:{listener.getsockname()[1]}", lost
-    finally:
-        listener.close()
+        do_GET = do_PUT = do_POST = do_HEAD = do_DELETE = answer
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as listener:
+        listener.daemon_threads = True
+        threading.Thread(target=listener.serve_forever, daemon=True).start()
+        try:
+            yield f"http://127.0.0.1:{listener.server_address[1]}", spoiled
+        finally:
+            listener.shutdown()
 
 
 def relabel(binary: str, source: Path, out: Path, *more: str, part: str = "0/1") -> tuple[int, dict, str]:  # noqa: F811
@@ -430,6 +514,60 @@ def test_what_is_there_of_another_run_is_left_alone(
     assert files(out) == before
 
 
+def test_what_a_killed_process_left_beside_a_piece_is_removed(binary: str, data: Path, tmp_path: Path) -> None:  # noqa: F811
+    assert relabel(binary, data, tmp_path / "out")[0] == 0
+    before = files(tmp_path / "out")
+    (piece,) = (p for p in (tmp_path / "out").iterdir() if p.name.endswith("_0001"))
+    left = piece.with_name(f"{piece.name}.relabel") / "refined"
+    left.mkdir(parents=True)
+    (left / "sets_00000000.refined").write_bytes(b"old")
+    _, again, _ = relabel(binary, data, tmp_path / "out")
+    assert again["frames"] == 0
+    assert files(tmp_path / "out") == before
+
+
+def test_two_processes_never_make_the_same_piece(binary: str, data: Path, tmp_path: Path) -> None:  # noqa: F811
+    assert relabel(binary, data, tmp_path / "calm")[0] == 0
+    command = [binary, "cdm", "relabel", str(data), "--out", str(tmp_path / "out"), "--engine", "fill"]
+    command += ["--shard", "0/1", "--json"]
+    both = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) for _ in range(3)]
+    ended = [(*p.communicate(timeout=WAIT_S * 4), p.returncode) for p in both]
+    assert all(code == 0 or (code == 1 and "another process makes this piece" in why) for _, why, code in ended), ended
+    made = [json.loads(said)["frames"] for said, _, code in ended if code == 0]
+    ended, rest, _ = relabel(binary, data, tmp_path / "out")
+    assert ended == 0
+    if len(made) == len(both):
+        assert sum(made) == rest["streams"][0]["frames"], "each frame is refined once"
+    assert files(tmp_path / "out") == files(tmp_path / "calm")
+
+
+def test_tiny_refines_segments_too(binary: str, data: Path, tmp_path: Path) -> None:  # noqa: F811
+    arguments = ["cdm", "relabel", str(data), "--json", "--shard", "0/1", "--engine", "tiny", "--out"]
+    ended, said, why = code(binary, *arguments, str(tmp_path / "out"))
+    if ended == 2 and "pip install onnxruntime" in why:
+        assert "DEPTHRIG_REQUIRE_ONNXRUNTIME" not in os.environ
+        pytest.skip("ONNX Runtime is not installed (tools/onnxruntime.sh)")
+    assert ended == 0, why
+    report = json.loads(said)
+    (stream,) = report["streams"]
+    assert stream["engine"].startswith("tiny onnxruntime")
+    assert stream["frames"] == report["sets"] > 0
+    # Whatever is made at once.
+    ended, _, why = code(binary, *arguments, str(tmp_path / "one"), "-j", "1")
+    assert ended == 0, why
+    assert files(tmp_path / "out") == files(tmp_path / "one")
+    # Another engine belongs into another folder.
+    ended, _, why = relabel(binary, data, tmp_path / "out")
+    assert (ended, "other arguments" in why) == (2, True), why
+    for more, cure in (
+        (["--model", "cdm-d435"], "runs a file NAME.onnx, not the installed model cdm-d435"),
+        (["--model", "gone.onnx"], "gone.onnx: cannot be read"),
+        (["--device", "cuda:0"], "cpu"),
+    ):
+        ended, _, why = code(binary, *arguments, str(tmp_path / "bad"), *more)
+        assert (ended, cure in why) == (2, True), why
+
+
 def test_what_cannot_be_refined_is_skipped_and_named(
     binary: str, runtime: Path, data: Path, tmp_path: Path  # noqa: F811
 ) -> None:
@@ -447,13 +585,8 @@ def test_what_cannot_be_refined_is_skipped_and_named(
     grey = record(binary, runtime, tmp_path / "grey", RIG)
     grey.rename(folder / "grey")
     (tmp_path / "images").mkdir()
-    for kind, mode in (("color", "RGB"), ("depth", "I;16")):
-        Image.new(mode, (32, 24), 700 if kind == "depth" else (9, 9, 9)).save(tmp_path / "images" / f"{kind}_1.png")
-    manifest = 'model = "M"\nrate_hz = 10.0\n[[stream]]\nname = "color"\nfiles = "color_*.png"\n'
-    manifest += '[[stream]]\nname = "depth"\nfiles = "depth_*.png"\ndepth_unit_m = 0.001\n'
-    (tmp_path / "images" / "camera.toml").write_text(manifest)
-    rig = 'rig = "lab"\n[[camera]]\nname = "cam"\nbackend = "files"\nmanifest = '
-    plain = record(binary, runtime, tmp_path / "plain", rig + json.dumps(str(tmp_path / "images")))
+    images(tmp_path / "images", np.full((24, 32), 700, np.uint16))
+    plain = record(binary, runtime, tmp_path / "plain", FILES + json.dumps(str(tmp_path / "images")))
     plain.rename(folder / "plain")
     (tmp_path / "live.toml").write_text(RIG + COLOR)
     arguments = ("run", str(tmp_path / "live.toml"), "--record", str(tmp_path / "live"))

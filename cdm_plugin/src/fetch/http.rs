@@ -28,6 +28,7 @@ pub fn agent(url: &str) -> Agent {
         .timeout_connect(Some(Duration::from_secs(30)))
         .timeout_recv_response(Some(Duration::from_mins(1)))
         .timeout_per_read(Some(Duration::from_mins(1)))
+        .timeout_per_write(Some(Duration::from_mins(1)))
         .user_agent(concat!("depthrig/", env!("CARGO_PKG_VERSION")));
     // This computer is never behind a proxy.
     let here = ["127.0.0.1", "localhost", "[::1]"].contains(&host(url));

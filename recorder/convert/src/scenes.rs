@@ -4,6 +4,7 @@
 //! is left alone, and sample `i` depends on the run's arguments and `i` alone: so a run that was killed goes on where
 //! it was, and any part can be made on any computer with the same bytes.
 
+use crate::RunPart;
 use crate::store::{Place, Remote};
 use core::sync::atomic::{AtomicU64, Ordering};
 use depthrig_bus::HostTime;
@@ -13,6 +14,7 @@ use depthrig_sim::synthetic::scenes::{Generator, Sensor, TriangleMesh};
 use serde::Serialize;
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{self, BufWriter};
+use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
 mod sample;
@@ -40,8 +42,8 @@ pub struct Plan {
     pub count: u64,
     /// Samples of a shard.
     pub per_shard: u64,
-    /// This part, from 0, and the number of parts: every `n`th shard.
-    pub part: (u64, u64),
+    /// This part: of the shards.
+    pub part: RunPart,
     /// Threads.
     pub threads: usize,
 }
@@ -125,7 +127,7 @@ pub fn write(
     record(generator, plan)?;
     let start = HostTime::now();
     let cpu = process_cpu_ns();
-    let mine: Vec<u64> = (0..plan.shards()).filter(|s| s % plan.part.1 == plan.part.0).collect();
+    let mine: Vec<u64> = (0..plan.shards()).filter(|s| plan.part.has(*s)).collect();
     let mut missing = Vec::new();
     for shard in &mine {
         if !plan.is_whole(*shard)? {
@@ -139,22 +141,21 @@ pub fn write(
     let mut done = total - missing.iter().map(length).sum::<u64>();
     let workers = workers(plan.threads)?;
     report.shards_missing = missing.len() as u64;
-    let mut go_on = progress(done, total);
+    if !progress(done, total) {
+        missing.clear();
+    }
     for shard in missing {
-        if !go_on {
-            break;
+        match one(generator, plan, shard, &workers, &mut |n| progress(done + n, total))? {
+            Made::Ended => break,
+            Made::Found => report.shards_found += 1,
+            Made::Bytes(bytes) => {
+                plan.hand_over(shard)?;
+                report.samples += length(&shard);
+                report.bytes += bytes;
+            }
         }
-        let made = one(generator, plan, shard, &workers, &mut |n| {
-            go_on = progress(done + n, total);
-            go_on
-        })?;
-        if let Some(bytes) = made {
-            plan.hand_over(shard)?;
-            done += length(&shard);
-            report.samples += length(&shard);
-            report.bytes += bytes;
-            report.shards_missing -= 1;
-        }
+        done += length(&shard);
+        report.shards_missing -= 1;
     }
     report.seconds = start.elapsed().as_secs_f64();
     report.cpu_seconds = (process_cpu_ns() - cpu) as f64 * 1e-9;
@@ -178,9 +179,6 @@ fn check(plan: &Plan) -> Result<()> {
     }
     if plan.shards() > 1_000_000 {
         return bad(format!("{} shards are too many; put more samples into each", plan.shards()));
-    }
-    if plan.part.0 >= plan.part.1 {
-        return bad(format!("invalid part {}/{}; parts are 0/n to n-1/n", plan.part.0, plan.part.1));
     }
     Ok(())
 }
@@ -269,16 +267,29 @@ fn workers(threads: usize) -> Result<Vec<rayon::ThreadPool>> {
     (0..threads.max(1)).map(pool).collect()
 }
 
-/// Makes one shard; its bytes, or nothing when the work was ended.
+/// Result for a shard.
+enum Made {
+    /// It was made, of so many bytes.
+    Bytes(u64),
+    /// Another process has made it meanwhile.
+    Found,
+    /// The work was ended before.
+    Ended,
+}
+
+/// Makes one shard.
 fn one(
     generator: &Generator,
     plan: &Plan,
     shard: u64,
     workers: &[rayon::ThreadPool],
     progress: &mut dyn FnMut(u64) -> bool,
-) -> Result<Option<u64>> {
+) -> Result<Made> {
     let path = plan.path(shard);
     let part = Part::create(&path)?;
+    if plan.is_whole(shard)? {
+        return Ok(Made::Found);
+    }
     let mut out = tar::Tar::new(BufWriter::with_capacity(1 << 20, &part.file));
     let wrote = |e: io::Error| Error::io("write", &path, e);
     let all = plan.samples(shard);
@@ -293,18 +304,25 @@ fn one(
             }
         }
         if !progress(next - first) {
-            return Ok(None);
+            return Ok(Made::Ended);
         }
     }
     let bytes = out.finish().map_err(wrote)?;
     part.rename(&path).map_err(wrote)?;
-    Ok(Some(bytes))
+    Ok(Made::Bytes(bytes))
 }
 
 /// A shard that is being written. Dropped before it got its name, it is removed.
 struct Part {
     file: File,
-    path: PathBuf,
+    /// `None` once it was renamed: another process may have this name by then.
+    path: Option<PathBuf>,
+}
+
+/// Whether `path` is the name of this file.
+fn is_named(file: &File, path: &Path) -> bool {
+    let both = file.metadata().and_then(|open| Ok((open, path.metadata()?)));
+    both.is_ok_and(|(open, named)| (open.dev(), open.ino()) == (named.dev(), named.ino()))
 }
 
 impl Part {
@@ -312,34 +330,44 @@ impl Part {
         let mut name = shard.as_os_str().to_owned();
         name.push(".part");
         let path = PathBuf::from(name);
-        // One that a killed run left is written anew.
-        let options = OpenOptions::new().write(true).create(true).truncate(false).open(&path);
-        let file = options.map_err(|e| Error::io("create", &path, e))?;
-        match file.try_lock() {
-            Err(TryLockError::WouldBlock) => {
-                let what = format!(
-                    "{}: another process makes this shard; give each its own --shard",
-                    path.display()
-                );
-                return Err(Error::new(ErrorKind::InUse, what));
+        loop {
+            // One that a killed run left is written anew.
+            let options = OpenOptions::new().write(true).create(true).truncate(false).open(&path);
+            let file = options.map_err(|e| Error::io("create", &path, e))?;
+            match file.try_lock() {
+                Err(TryLockError::WouldBlock) => {
+                    let what = format!(
+                        "{}: another process makes this shard; give each its own --shard",
+                        path.display()
+                    );
+                    return Err(Error::new(ErrorKind::InUse, what));
+                }
+                // Some network file systems have no locks.
+                Err(TryLockError::Error(_)) | Ok(()) => {}
             }
-            // Some network file systems have no locks.
-            Err(TryLockError::Error(_)) | Ok(()) => {}
+            // Between opening and locking another process may have completed it: then this is the shard itself.
+            if is_named(&file, &path) {
+                file.set_len(0).map_err(|e| Error::io("write", &path, e))?;
+                return Ok(Self { file, path: Some(path) });
+            }
         }
-        file.set_len(0).map_err(|e| Error::io("write", &path, e))?;
-        Ok(Self { file, path })
     }
 
-    fn rename(self, to: &Path) -> io::Result<()> {
+    fn rename(mut self, to: &Path) -> io::Result<()> {
         self.file.sync_all()?;
-        std::fs::rename(&self.path, to)?;
+        if let Some(path) = &self.path {
+            std::fs::rename(path, to)?;
+        }
+        self.path = None;
         depthrig_bus::files::sync_folder_of(to)
     }
 }
 
 impl Drop for Part {
     fn drop(&mut self) {
-        drop(std::fs::remove_file(&self.path)); // gone already when it was renamed
+        if let Some(path) = &self.path {
+            drop(std::fs::remove_file(path));
+        }
     }
 }
 

@@ -3,8 +3,9 @@
 //! Objects are copied to this computer, worked on, and their results put: an object is complete or not there, and one
 //! that is there is never written again.
 
-use depthrig_bus::files;
+use depthrig_bus::files::{self, NewFile};
 use depthrig_recorder::{Error, ErrorKind, Result};
+use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
 mod http;
@@ -61,11 +62,31 @@ impl Place {
                 let path = folder.join(name);
                 match files::read(&path, files::TEXT_MAX_BYTES) {
                     Ok(bytes) => Ok(Some(bytes)),
-                    Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(None),
+                    Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(None),
                     Err(e) => Err(Error::reading("read", &path, e)),
                 }
             }
             Self::Remote(remote) => remote.read(name),
+        }
+    }
+
+    /// Writes a small file, unless one of that name is there; says whether it did.
+    fn put_new(&self, name: &str, bytes: &[u8]) -> Result<bool> {
+        match self {
+            Self::Local(folder) => {
+                let path = folder.join(name);
+                let write = || {
+                    let mut file = NewFile::beside(&path)?;
+                    file.write_all(bytes)?;
+                    file.create()
+                };
+                match write() {
+                    Ok(()) => Ok(true),
+                    Err(e) if e.kind() == io::ErrorKind::AlreadyExists => Ok(false),
+                    Err(e) => Err(Error::io("write", &path, e)),
+                }
+            }
+            Self::Remote(remote) => remote.put_new(name, bytes),
         }
     }
 
@@ -74,15 +95,11 @@ impl Place {
     /// # Errors
     /// [`ErrorKind::BadInput`] when it is not; and as the place says.
     pub(crate) fn agree_on(&self, name: &str, text: &[u8], cure: &str) -> Result<()> {
-        let there = match (self.read(name)?, self) {
-            (Some(there), _) => there,
-            (None, Self::Local(folder)) => {
-                let path = folder.join(name);
-                return files::replace(&path, text).map_err(|e| Error::io("write", &path, e));
-            }
-            (None, Self::Remote(remote)) if remote.put_new(name, text)? => return Ok(()),
+        let there = match self.read(name)? {
+            Some(there) => there,
+            None if self.put_new(name, text)? => return Ok(()),
             // Another part has just put it.
-            (None, Self::Remote(remote)) => remote.read(name)?.unwrap_or_default(),
+            None => self.read(name)?.unwrap_or_default(),
         };
         if there == text {
             return Ok(());

@@ -2,14 +2,15 @@
 
 use crate::context::Context;
 use crate::exit::{Exit, UsageError};
-use crate::machines::{Scratch, part, path_of};
 use crate::out;
 use crate::outfile::{OutFile, Overwrite};
 use crate::progress::Progress;
+use crate::scratch::{Scratch, path_of};
 use crate::signals::Stop;
 use crate::watched::usage;
 use anyhow::{Result, bail};
 use clap::ValueEnum;
+use depthrig_convert::RunPart;
 use depthrig_convert::scenes::{self, Plan, contact_sheet};
 use depthrig_convert::store::Place;
 use depthrig_sim::synthetic::scenes::{Family, Generator, Sensor, Settings, TriangleMesh, Triplet};
@@ -72,8 +73,8 @@ pub struct ScenesArgs {
     #[arg(long, value_name = "N", default_value_t = 500, value_parser = clap::value_parser!(u64).range(1..=100_000))]
     per_shard: u64,
     /// Part of the run to make: K of N, from 0
-    #[arg(long, value_name = "K/N", default_value = "0/1", value_parser = part)]
-    shard: [u64; 2],
+    #[arg(long, value_name = "K/N", default_value_t = RunPart::ALL)]
+    shard: RunPart,
     #[command(flatten)]
     scratch: Scratch,
     /// First part of the shards' names
@@ -142,7 +143,7 @@ pub fn run(args: &ScenesArgs, context: &Context) -> Result<Exit> {
         name: args.name.clone(),
         count: args.count,
         per_shard: args.per_shard,
-        part: args.shard.into(),
+        part: args.shard,
         threads: args.threads.map_or_else(cores, usize::from),
     };
     let report = scenes::write(&generator, &plan, &mut |done, total| {

@@ -5,6 +5,7 @@
 //! be made anywhere, and again. `merge` joins the pieces of a recording.
 
 use super::{Form, RelabelOptions, RelabelReport, RelabelledStream, Step, make, pairs, plan};
+use crate::RunPart;
 use crate::store::{Place, Remote};
 use depthrig_bus::HostTime;
 use depthrig_bus::clock::process_cpu_ns;
@@ -35,8 +36,8 @@ pub struct Pieces {
     pub input: Place,
     /// Where the pieces go.
     pub out: Place,
-    /// This part, from 0, and the number of parts: every `n`th segment of all datasets in the order of their names.
-    pub part: (u64, u64),
+    /// This part: of the segments of all datasets, in the order of their names.
+    pub part: RunPart,
     /// Folder for copies of what lies in buckets.
     pub scratch: PathBuf,
 }
@@ -131,7 +132,7 @@ enum Outcome {
 /// Makes the pieces of a part that are missing.
 ///
 /// # Errors
-/// [`ErrorKind::BadInput`] for an impossible part, an input without a dataset, a refiner that cannot be created, and when
+/// [`ErrorKind::BadInput`] for an input without a dataset, a refiner that cannot be created, and when
 /// the pieces that are there are of other arguments or of another state of their source; [`ErrorKind::InUse`] when another
 /// process makes the same piece; and errors of reading and writing. What was made before stays, and a later run goes on.
 pub fn relabel_pieces(
@@ -139,10 +140,6 @@ pub fn relabel_pieces(
     options: &RelabelOptions,
     progress: PiecesProgress<'_>,
 ) -> Result<PiecesReport> {
-    if run.part.0 >= run.part.1 {
-        let what = format!("invalid part {}/{}; parts are 0/n to n-1/n", run.part.0, run.part.1);
-        return Err(Error::new(ErrorKind::BadInput, what));
-    }
     let refiners = Installed::new(options.cdm.clone());
     let work = Work { run, options, refiners: &refiners };
     let start = HostTime::now();
@@ -154,7 +151,7 @@ pub fn relabel_pieces(
     work.record()?;
     let mut report = PiecesReport { out: run.out.to_string(), ..PiecesReport::default() };
     let units = listed.iter().flat_map(Listed::units);
-    let mine = units.enumerate().filter(|(i, _)| *i as u64 % run.part.1 == run.part.0).map(|(_, unit)| unit);
+    let mine = units.enumerate().filter(|(i, _)| run.part.has(*i as u64)).map(|(_, unit)| unit);
     let mut is_ended = false;
     for unit in mine {
         report.pieces += 1;
@@ -275,7 +272,13 @@ impl Work<'_> {
     fn piece(&self, segment: &Segment<'_>, progress: PiecesProgress<'_>) -> Result<Outcome> {
         let name = segment.piece();
         let out = self.run.out.at(&name);
+        let path = match &out {
+            Place::Local(path) => path.clone(),
+            Place::Remote(_) => self.run.scratch.join("pieces").join(&name),
+        };
+        let work = super::work_folder(&path)?;
         if let Some(account) = found(&out, &segment.source())? {
+            tidy(&work);
             return Ok(Outcome::Found(account));
         }
         if let Err(e) = pairs(segment.listed.dataset.session()) {
@@ -289,18 +292,14 @@ impl Work<'_> {
             return Ok(Outcome::Skipped(why.unwrap_or_else(|| "it holds no set".to_owned())));
         }
         drop(sets);
-        let path = match &out {
-            Place::Local(path) => path.clone(),
-            Place::Remote(_) => self.run.scratch.join("pieces").join(&name),
-        };
-        let work = super::work_folder(&path)?;
         let Some(_lock) = lock(&work)? else {
             let what =
                 format!("{}: another process makes this piece; give each its own --shard", work.display());
             return Err(Error::new(ErrorKind::InUse, what));
         };
-        // It may have been made while the lock was waited for.
+        // Another process may have made it meanwhile.
         if let Some(account) = found(&out, &segment.source())? {
+            drop(std::fs::remove_dir_all(&work));
             return Ok(Outcome::Found(account));
         }
         let mut made = None;
@@ -379,6 +378,13 @@ fn lock(work: &Path) -> Result<Option<Box<dyn Send + Sync>>> {
         Ok(lock) => Ok(Some(lock)),
         Err(e) if e.kind() == io::ErrorKind::WouldBlock => Ok(None),
         Err(e) => Err(Error::io("lock the folder", work, e)),
+    }
+}
+
+/// Removes what a process has left that was killed between the last two steps: naming a piece, and removing this folder.
+fn tidy(work: &Path) {
+    if work.is_dir() && RealFs.lock(work).is_ok() {
+        drop(std::fs::remove_dir_all(work));
     }
 }
 

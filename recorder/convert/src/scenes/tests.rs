@@ -13,7 +13,7 @@ fn plan(folder: &Path) -> Plan {
         name: "t".into(),
         count: 7,
         per_shard: 3,
-        part: (0, 1),
+        part: RunPart::ALL,
         threads: 2,
     }
 }
@@ -105,7 +105,7 @@ fn parts_made_anywhere_are_the_bytes_of_the_run() {
     let two = tempfile::tempdir().unwrap();
     go(&plan(one.path()));
     for k in [1, 0] {
-        go(&Plan { part: (k, 2), threads: 1, ..plan(two.path()) });
+        go(&Plan { part: [k, 2].try_into().unwrap(), threads: 1, ..plan(two.path()) });
     }
     assert_eq!(files(one.path()), files(two.path()));
 }
@@ -160,13 +160,40 @@ fn another_run_another_process_and_impossible_plans_are_refused() {
     part.lock().unwrap();
     let e = refused(&plan(dir.path()));
     assert_eq!(e.kind(), ErrorKind::InUse, "{e}");
-    for bad in [
-        Plan { name: "../t".into(), ..plan(dir.path()) },
-        Plan { per_shard: 0, ..plan(dir.path()) },
-        Plan { part: (2, 2), ..plan(dir.path()) },
-    ] {
+    for bad in [Plan { name: "../t".into(), ..plan(dir.path()) }, Plan { per_shard: 0, ..plan(dir.path()) }] {
         assert_eq!(refused(&bad).kind(), ErrorKind::BadInput);
     }
+}
+
+#[test]
+fn a_part_that_became_a_shard_is_not_the_part_any_more() {
+    let dir = tempfile::tempdir().unwrap();
+    let shard = dir.path().join("t-000000.tar");
+    let part = Part::create(&shard).unwrap();
+    let name = part.path.clone().unwrap();
+    let opened = File::open(&name).unwrap();
+    assert!(is_named(&opened, &name));
+    part.rename(&shard).unwrap();
+    assert!(!is_named(&opened, &name), "it has another name");
+    std::fs::write(&name, "of another process").unwrap();
+    assert!(!is_named(&opened, &name) && is_named(&opened, &shard));
+}
+
+#[test]
+fn a_shard_that_was_made_meanwhile_is_left_alone() {
+    let dir = tempfile::tempdir().unwrap();
+    let p = plan(dir.path());
+    let mut is_first = true;
+    let report = write(&generator(), &p, &mut |_, _| {
+        // Another process makes all of them between the list of what is missing and the first shard.
+        if std::mem::take(&mut is_first) {
+            go(&p);
+        }
+        true
+    });
+    let report = report.unwrap();
+    assert_eq!((report.shards_found, report.samples, report.shards_missing), (3, 0, 0));
+    assert_eq!(files(dir.path()).len(), 4, "three shards and their arguments");
 }
 
 #[test]

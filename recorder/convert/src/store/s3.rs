@@ -19,6 +19,8 @@ use tokio::runtime::Runtime;
 const PART: u64 = 16 << 20;
 /// How often a request is sent again before the server counts as away.
 const RETRIES: usize = 5;
+/// Wait before a write is tried again that was in the way of another one.
+const CONFLICT_WAIT: Duration = Duration::from_millis(200);
 /// The endpoint without `AWS_ENDPOINT_URL`, in messages.
 const AWS: &str = "Amazon S3";
 
@@ -170,21 +172,30 @@ impl Remote {
     /// # Errors
     /// As the server says.
     pub fn put_new(&self, name: &str, bytes: &[u8]) -> Result<bool> {
-        let options = PutOptions { mode: PutMode::Create, ..PutOptions::default() };
+        let key = self.key(name);
         let payload = PutPayload::from(bytes.to_vec());
-        match self.runtime.block_on(self.store.put_opts(&self.key(name), payload, options)) {
-            Ok(_) => Ok(true),
-            Err(object_store::Error::AlreadyExists { .. }) => Ok(false),
-            Err(e) => Err(self.failed("write", name, e)),
+        let mut tries = 0;
+        loop {
+            let options = PutOptions { mode: PutMode::Create, ..PutOptions::default() };
+            match self.runtime.block_on(self.store.put_opts(&key, payload.clone(), options)) {
+                Ok(_) => return Ok(true),
+                Err(object_store::Error::AlreadyExists { .. }) if self.size(name)?.is_some() => {
+                    return Ok(false);
+                }
+                // The answer to requests that were in each other's way (409), too: then there may be nothing.
+                Err(object_store::Error::AlreadyExists { .. }) if tries < RETRIES => tries += 1,
+                Err(e) => return Err(self.failed("write", name, e)),
+            }
+            std::thread::sleep(CONFLICT_WAIT);
         }
     }
 
-    /// Puts a file, unless an object of that name is there; says whether it did. A large one goes in parts: until the
-    /// last of them is there, nothing is.
+    /// Puts a file, unless an object of that name and size is there. A large one goes in parts: until the last of them is
+    /// there, nothing is.
     ///
     /// # Errors
-    /// As the server and the file system say.
-    pub fn put_file(&self, from: &Path, name: &str) -> Result<bool> {
+    /// [`ErrorKind::AlreadyExists`] when an object of another size is there; as the server and the file system say.
+    pub fn put_file(&self, from: &Path, name: &str) -> Result<()> {
         let reading = |e| Error::reading("read", from, e);
         let mut file = depthrig_bus::files::open(from).map_err(reading)?;
         let size = file.metadata().map_err(reading)?.len();
@@ -194,10 +205,13 @@ impl Remote {
             Ok::<_, Error>(part)
         };
         if size <= PART {
-            return self.put_new(name, &next(0)?);
+            if !self.put_new(name, &next(0)?)? {
+                self.is_there(name, size)?;
+            }
+            return Ok(());
         }
-        if self.size(name)?.is_some() {
-            return Ok(false);
+        if self.is_there(name, size)? {
+            return Ok(());
         }
         let failed = |e| self.failed("write", name, e);
         let key = self.key(name);
@@ -205,14 +219,33 @@ impl Remote {
         let sent = self.parts(&mut *upload, size, &mut next, name);
         // Another machine may have made the same meanwhile. A part of an upload has no condition, so this is looked at as late as
         // possible; whoever comes in between puts the same bytes.
-        let is_there = sent.and_then(|()| self.size(name));
-        if !matches!(is_there, Ok(None)) {
+        let is_there = sent.and_then(|()| self.is_there(name, size));
+        if !matches!(is_there, Ok(false)) {
             // Parts that cannot be removed stay until the bucket's own rule removes them.
             drop(self.runtime.block_on(upload.abort()));
-            return is_there.map(|_| false);
+            return is_there.map(drop);
         }
-        self.runtime.block_on(upload.complete()).map_err(failed)?;
-        Ok(true)
+        match self.runtime.block_on(upload.complete()) {
+            // When the answer is lost and the request sent again, the server knows of no such upload any more.
+            Err(e) if !self.is_there(name, size)? => Err(failed(e)),
+            _ => Ok(()),
+        }
+    }
+
+    /// Whether an object of this size is there.
+    fn is_there(&self, name: &str, size: u64) -> Result<bool> {
+        match self.size(name)? {
+            None => Ok(false),
+            Some(there) if there == size => Ok(true),
+            Some(there) => Err(Error::new(
+                ErrorKind::AlreadyExists,
+                format!(
+                    "{} has {there} bytes instead of {size}: another computer made it differently; use the same --threads and \
+                     kind of CPU for all parts, or remove it",
+                    self.at(name)
+                ),
+            )),
+        }
     }
 
     fn parts(

@@ -2,10 +2,11 @@
 
 use crate::context::Context;
 use crate::exit::Exit;
-use crate::machines::{Scratch, path_of};
 use crate::out;
+use crate::scratch::{Scratch, path_of};
 use crate::watched::{usage, watched};
 use anyhow::Result;
+use depthrig_convert::RunPart;
 use depthrig_convert::relabel::{
     Pieces, PiecesReport, RelabelOptions, RelabelledStream, Step, relabel_pieces,
 };
@@ -18,8 +19,8 @@ pub struct Request<'a> {
     pub input: &'a Path,
     /// Folder of the pieces, here or in a bucket.
     pub out: &'a Path,
-    /// The part and the number of parts.
-    pub part: [u64; 2],
+    /// The part.
+    pub part: RunPart,
     /// Folder for copies.
     pub scratch: &'a Scratch,
     /// Whether the report is printed as JSON.
@@ -31,8 +32,7 @@ pub fn run(request: &Request<'_>, options: &RelabelOptions, context: &Context) -
     let input = Place::parse(request.input).map_err(usage)?;
     let out = Place::parse(request.out).map_err(usage)?;
     let scratch = request.scratch.folder(&[&input, &out])?;
-    let part = request.part.into();
-    let pieces = Pieces { input, out, part, scratch: path_of(scratch.as_ref()) };
+    let pieces = Pieces { input, out, part: request.part, scratch: path_of(scratch.as_ref()) };
     let report = watched(context, |progress| {
         relabel_pieces(&pieces, options, &mut |piece, step, done, total| {
             progress(&format!("{piece}: {}", step_name(step)), done, total)
@@ -95,6 +95,9 @@ fn print(report: &PiecesReport) -> Result<()> {
             percent(s.holes_before, s),
             percent(s.holes, s)
         ))?;
+        if let Some(note) = &s.note {
+            out::line(format_args!("  note: {note}"))?;
+        }
     }
     Ok(())
 }

@@ -4,17 +4,20 @@ use super::pieces::{Request, step_name};
 use super::store::Models;
 use crate::context::Context;
 use crate::exit::{Exit, UsageError};
-use crate::machines::{Scratch, part};
 use crate::out;
+use crate::scratch::Scratch;
 use crate::watched::{DerivedDataset, watched};
 use anyhow::Result;
 use clap::ValueEnum;
 use depthrig_cdm::FillRefiner;
 use depthrig_cdm::stage::{CdmConfig, EngineChoice, RefineConfig, RefineModel};
+use depthrig_cdm::store::names_a_file;
+use depthrig_cdm::tiny::is_tiny_file;
+use depthrig_convert::RunPart;
 use depthrig_convert::relabel::{RelabelOptions, RelabelReport, relabel};
 use depthrig_convert::store::Place;
 use depthrig_recorder::Dataset;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
@@ -43,7 +46,9 @@ enum Engine {
     Auto,
     /// Colour-guided hole filling; needs no model
     Fill,
-    /// ONNX Runtime
+    /// The small network of this program after fill, or a NAME.onnx like it
+    Tiny,
+    /// ONNX Runtime with a camera depth model
     Onnxruntime,
 }
 
@@ -61,7 +66,7 @@ pub struct RelabelArgs {
     /// Engine that refines depth
     #[arg(long, value_enum, default_value = "auto")]
     engine: Engine,
-    /// Installed model or checkpoint file for all cameras [default: per camera]
+    /// Installed model, checkpoint or NAME.onnx for all cameras [default: per camera]
     #[arg(long, value_name = "MODEL")]
     model: Option<String>,
     /// Shorter side of the network's input, pixels [default: the model's]
@@ -76,18 +81,18 @@ pub struct RelabelArgs {
     /// Treat depth as registered to colour, regardless of the calibration
     #[arg(long)]
     is_aligned: bool,
-    /// Reach of fill from measured depth, fraction of the width; 1: no limit
+    /// Reach of fill and tiny from measured depth, fraction of the width; 1: no limit
     #[arg(long, value_name = "PART", value_parser = crate::args::fill_reach, default_value_t = FillRefiner::REACH)]
     fill_reach: f64,
-    /// Images to process in parallel [default: one per core; 1 with a network]
+    /// Images to process in parallel [default: one per core; 1 with a depth model]
     #[arg(short = 'j', long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
     jobs: Option<u16>,
-    /// Threads per image [default: 1; all cores with a network]
+    /// Threads per image [default: 1; all cores with a depth model]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: Option<u16>,
-    /// Part of the segments to refine: K of N, from 0 [default with s3://: 0/1]
-    #[arg(long, value_name = "K/N", value_parser = part)]
-    shard: Option<[u64; 2]>,
+    /// Part of the segments to refine: K of N, from 0; s3:// without it: 0/1
+    #[arg(long, value_name = "K/N")]
+    shard: Option<RunPart>,
     #[command(flatten)]
     scratch: Scratch,
     #[command(flatten)]
@@ -99,14 +104,18 @@ pub struct RelabelArgs {
 
 impl RelabelArgs {
     fn options(&self) -> RelabelOptions {
+        let is_tiny = self.model.as_deref().is_some_and(|name| is_tiny_file(Path::new(name)));
         let engine = match self.engine {
+            Engine::Auto if is_tiny => EngineChoice::Tiny,
             Engine::Auto => EngineChoice::Auto,
             Engine::Fill => EngineChoice::Fill,
+            Engine::Tiny => EngineChoice::Tiny,
             Engine::Onnxruntime => EngineChoice::OnnxRuntime,
         };
         let model = self.model.as_ref().map(|name| {
             let path = PathBuf::from(name);
-            if path.is_file() { RefineModel::File(path) } else { RefineModel::Installed(name.clone()) }
+            let is_file = names_a_file(name) || path.is_file();
+            if is_file { RefineModel::File(path) } else { RefineModel::Installed(name.clone()) }
         });
         let refine = RefineConfig {
             engine,
@@ -123,7 +132,8 @@ impl RelabelArgs {
             ..CdmConfig::default()
         };
         let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
-        let (workers, threads) = if self.engine == Engine::Fill { (cores, 1) } else { (1, cores) };
+        let is_light = matches!(engine, EngineChoice::Fill | EngineChoice::Tiny);
+        let (workers, threads) = if is_light { (cores, 1) } else { (1, cores) };
         RelabelOptions {
             refine,
             cdm,
@@ -143,7 +153,7 @@ pub fn run(args: &RelabelArgs, context: &Context) -> Result<Exit> {
         let request = Request {
             input: &args.dataset,
             out,
-            part: args.shard.unwrap_or([0, 1]),
+            part: args.shard.unwrap_or(RunPart::ALL),
             scratch: &args.scratch,
             json: args.json,
         };

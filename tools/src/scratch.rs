@@ -1,4 +1,4 @@
-//! Arguments of commands that share their work between machines.
+//! The folder for copies of what lies in a bucket.
 
 use anyhow::Result;
 use depthrig_convert::store::Place;
@@ -36,28 +36,4 @@ impl Scratch {
 /// Path of a scratch folder; unused without one.
 pub fn path_of(scratch: Option<&tempfile::TempDir>) -> PathBuf {
     scratch.map_or(Path::new(""), tempfile::TempDir::path).to_owned()
-}
-
-/// Parses a part such as `2/8`.
-///
-/// # Errors
-/// A message when the text has another form.
-pub fn part(text: &str) -> Result<[u64; 2], String> {
-    let wrong = || format!("write a part such as 2/8 (0/8 to 7/8), not \"{text}\"");
-    let (k, n) = text.split_once('/').ok_or_else(wrong)?;
-    let [k, n] = [k.parse().map_err(|_| wrong())?, n.parse().map_err(|_| wrong())?];
-    if k < n && n <= 1_000_000 { Ok([k, n]) } else { Err(wrong()) }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn parts_are_checked() {
-        assert_eq!(part("2/8"), Ok([2, 8]));
-        for bad in ["8/8", "1", "-1/2", "a/b", "0/0", "1/2/3", "1/1000001"] {
-            assert!(part(bad).unwrap_err().contains("2/8"), "{bad}");
-        }
-    }
 }
