@@ -566,6 +566,7 @@ def test_tiny_refines_segments_too(binary: str, data: Path, tmp_path: Path) -> N
     ):
         ended, _, why = code(binary, *arguments, str(tmp_path / "bad"), *more)
         assert (ended, cure in why) == (2, True), why
+        assert not (tmp_path / "bad").exists(), "nothing hinders the corrected command"
 
 
 def test_what_cannot_be_refined_is_skipped_and_named(

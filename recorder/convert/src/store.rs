@@ -90,22 +90,32 @@ impl Place {
         }
     }
 
-    /// Writes what all parts of a run must agree on, or checks that what is there is the same.
+    /// Whether a file is there that says this; what all parts of a run must agree on.
     ///
     /// # Errors
-    /// [`ErrorKind::BadInput`] when it is not; and as the place says.
-    pub(crate) fn agree_on(&self, name: &str, text: &[u8], cure: &str) -> Result<()> {
-        let there = match self.read(name)? {
-            Some(there) => there,
-            None if self.put_new(name, text)? => return Ok(()),
-            // Another part has just put it.
-            None => self.read(name)?.unwrap_or_default(),
-        };
-        if there == text {
-            return Ok(());
+    /// [`ErrorKind::BadInput`] when it says something else; and as the place says.
+    pub(crate) fn agrees_on(&self, name: &str, text: &[u8], cure: &str) -> Result<bool> {
+        match self.read(name)? {
+            None => Ok(false),
+            Some(there) if there == text => Ok(true),
+            Some(_) => {
+                let what =
+                    format!("{self}/{name} is of a run with other arguments or another version; {cure}");
+                Err(Error::new(ErrorKind::BadInput, what))
+            }
         }
-        let what = format!("{self}/{name} is of a run with other arguments or another version; {cure}");
-        Err(Error::new(ErrorKind::BadInput, what))
+    }
+
+    /// The same, and writes the file if it is not there.
+    ///
+    /// # Errors
+    /// As [`Self::agrees_on`].
+    pub(crate) fn agree_on(&self, name: &str, text: &[u8], cure: &str) -> Result<()> {
+        if !self.agrees_on(name, text, cure)? && !self.put_new(name, text)? {
+            // Another part has just put it.
+            self.agrees_on(name, text, cure)?;
+        }
+        Ok(())
     }
 }
 

@@ -26,6 +26,7 @@ use sources::{Listed, Segment, list};
 const FORMAT: u32 = 1;
 /// The arguments of a run, beside its pieces.
 const RUN_FILE: &str = "relabel.json";
+const OTHER_FOLDER: &str = "give this run another folder";
 /// The account of a piece, in it.
 const ACCOUNT_FILE: &str = "account.json";
 
@@ -148,7 +149,7 @@ pub fn relabel_pieces(
     if let (Place::Local(out), Place::Local(input)) = (&run.out, &run.input) {
         depthrig_recorder::check_outside(out, input)?;
     }
-    work.record()?;
+    work.run.out.agrees_on(RUN_FILE, &work.arguments()?, OTHER_FOLDER)?;
     let mut report = PiecesReport { out: run.out.to_string(), ..PiecesReport::default() };
     let units = listed.iter().flat_map(Listed::units);
     let mine = units.enumerate().filter(|(i, _)| run.part.has(*i as u64)).map(|(_, unit)| unit);
@@ -242,8 +243,8 @@ struct Run<'a> {
 }
 
 impl Work<'_> {
-    /// Writes the arguments beside the pieces, or checks that those that are there agree.
-    fn record(&self) -> Result<()> {
+    /// The arguments, as they lie beside the pieces.
+    fn arguments(&self) -> Result<Vec<u8>> {
         let refine = &self.options.refine;
         let run = Run {
             format: FORMAT,
@@ -261,12 +262,16 @@ impl Work<'_> {
             is_aligned: refine.is_aligned,
             fill_reach: refine.fill_reach,
         };
-        let text = json(&run)?;
+        json(&run)
+    }
+
+    /// Writes the arguments beside the pieces; of a run with a refiner that works.
+    fn record(&self) -> Result<()> {
         if let Place::Local(folder) = &self.run.out {
             depthrig_bus::umask::create_dir_all(folder)
                 .map_err(|e| Error::io("create the folder", folder, e))?;
         }
-        self.run.out.agree_on(RUN_FILE, &text, "give this run another folder")
+        self.run.out.agree_on(RUN_FILE, &self.arguments()?, OTHER_FOLDER)
     }
 
     fn piece(&self, segment: &Segment<'_>, progress: PiecesProgress<'_>) -> Result<Outcome> {
@@ -285,6 +290,7 @@ impl Work<'_> {
             return Ok(Outcome::Skipped(e.to_string()));
         }
         let planned = plan(self.refiners, segment.listed.dataset.session(), self.options)?;
+        self.record()?;
         let fetched = segment.fetch()?;
         let sets = fetched.dataset.set_reader()?;
         if sets.times().is_empty() {
