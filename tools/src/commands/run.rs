@@ -135,7 +135,11 @@ fn wait_for_refiners(rig: &Rig, cameras: &[String], stop: &Stop, quiet: bool) ->
         if starting == 0 {
             break;
         }
-        shown.set("starting refiners, then recording", (cameras.len() - starting) as u64, cameras.len() as u64);
+        shown.set(
+            "starting refiners, then recording",
+            (cameras.len() - starting) as u64,
+            cameras.len() as u64,
+        );
         if rig.is_stop_asked() || stop.wait(LOOK) {
             return false;
         }
