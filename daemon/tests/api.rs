@@ -163,6 +163,12 @@ fn every_answer_of_a_live_server_fits_the_document() {
     check("GET", "/v1/record/losses", &served.get("/v1/record/losses"), 200);
     check("POST", "/v1/record/note", &served.post("/v1/record/note", r#"{"text": "lamp on"}"#), 204);
     check("POST", "/v1/record/note", &served.post("/v1/record/note", r#"{"text": ""}"#), 400);
+    let start = r#"{"action": "start", "task": "cup"}"#;
+    check("POST", "/v1/episode", &served.post("/v1/episode", start), 200);
+    check("POST", "/v1/episode", &served.post("/v1/episode", r#"{"action": "stop"}"#), 409);
+    for bad in [r#"{"action": "go"}"#, r#"{"action": "start", "outcome": "success"}"#, "{}"] {
+        check("POST", "/v1/episode", &served.post("/v1/episode", bad), 400);
+    }
     check("POST", "/v1/record/stop", &served.post("/v1/record/stop", ""), 200);
     check("GET", "/v1/calibration", &served.get("/v1/calibration"), 200);
     check("GET", "/v1/health", &served.get("/v1/health"), 503);

@@ -78,8 +78,9 @@ pub use recover::{
 };
 pub use select::{Edge, Moment, SetSpan};
 pub use session::{
-    Computed, Derived, Edit, FORMAT, Mark, MotionRecord, NOTE_MAX_BYTES, Note, Outcome, SESSION_FILE,
-    Session, SessionChanges, StreamCalibration, StreamRecord, UnitCalibration, check_name, edit, rename,
+    Computed, Derived, Edit, Episode, EpisodeCounts, EpisodeEnd, EpisodeOutcome, FORMAT, Mark, MotionRecord,
+    NOTE_MAX_BYTES, Note, Outcome, SESSION_FILE, Session, SessionChanges, StreamCalibration, StreamRecord,
+    UnitCalibration, check_name, edit, rename,
 };
 pub use slice::{SliceOptions, SliceProgress, SliceReport, merge, trim};
 pub use still::{StillFormat, still};

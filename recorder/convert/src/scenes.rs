@@ -10,16 +10,18 @@ use core::sync::atomic::{AtomicU64, Ordering};
 use depthrig_bus::HostTime;
 use depthrig_bus::clock::process_cpu_ns;
 use depthrig_recorder::{Error, ErrorKind, Result};
-use depthrig_sim::synthetic::scenes::{Generator, Sensor, TriangleMesh};
+use depthrig_sim::synthetic::scenes::{Generator, Sensor, TriangleMesh, Triplet};
 use serde::Serialize;
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{self, BufWriter};
 use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
+mod dataset;
 mod sample;
 mod tar;
 
+pub use dataset::SceneSets;
 pub use sample::contact_sheet;
 
 /// Version of the layout.
@@ -386,10 +388,7 @@ fn make(
             if number >= batch.end {
                 return Ok::<_, Error>(made);
             }
-            let wrong = |e: depthrig_driver::Error| {
-                Error::new(ErrorKind::BadInput, format!("sample {number}: {e}")).with_source(e)
-            };
-            let triplet = generator.sample(number).map_err(wrong)?;
+            let triplet = sample_of(generator, number)?;
             made.push((number, sample::members(&triplet, generator.settings(), &mut fill)?));
         }
     };
@@ -404,6 +403,13 @@ fn make(
     }
     all.sort_unstable_by_key(|(number, _)| *number);
     Ok(all.into_iter().map(|(_, members)| members).collect())
+}
+
+/// A sample, or which one could not be made.
+fn sample_of(generator: &Generator, number: u64) -> Result<Triplet> {
+    generator
+        .sample(number)
+        .map_err(|e| Error::new(ErrorKind::BadInput, format!("sample {number}: {e}")).with_source(e))
 }
 
 #[cfg(test)]

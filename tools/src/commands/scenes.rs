@@ -34,14 +34,18 @@ Examples:
   depthrig scenes --seed 8 --count 500 --without bottle,cup --out train
   depthrig scenes --count 20000 --hide 0.5 --out train
   depthrig scenes --count 20000 --sensor stereo --shard 2/8 --out train
-  depthrig scenes --count 12 --preview sheet.png";
+  depthrig scenes --count 12 --preview sheet.png
+  depthrig scenes --count 50 --camera d435 --dataset data/random";
 
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct ScenesArgs {
     /// Folder of the shards, or s3://BUCKET/PREFIX
-    #[arg(long, value_name = "DIR", required_unless_present = "preview")]
+    #[arg(long, value_name = "DIR", required_unless_present_any = ["preview", "dataset"])]
     out: Option<PathBuf>,
+    /// New dataset, instead of shards: a world each set, one camera with its nominal lens, and true depth
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["out", "per_shard", "shard", "scratch", "name", "threads"])]
+    dataset: Option<PathBuf>,
     /// Seed of the run
     #[arg(long, value_name = "N", default_value_t = 0)]
     seed: u64,
@@ -129,6 +133,9 @@ pub fn run(args: &ScenesArgs, context: &Context) -> Result<Exit> {
         bar.clear();
         preview.write(&contact_sheet(&samples, generator.settings())?)?;
     }
+    if let Some(dataset) = &args.dataset {
+        return super::import::scenes(generator, args.count, dataset, args.json, context);
+    }
     let Some(out) = &args.out else { return Ok(Exit::Good) };
     let place = Place::parse(out).map_err(usage)?;
     let scratch = args.scratch.folder(&[&place])?;
@@ -191,6 +198,7 @@ fn settings(args: &ScenesArgs) -> Result<Settings> {
             SensorName::Stereo => Sensor::Stereo,
         },
         hide: args.hide,
+        nominal_lens: args.dataset.is_some(),
         families: all.into_iter().filter(|f| !args.without.contains(f)).collect(),
         meshes,
     })

@@ -74,6 +74,8 @@ pub struct Settings {
     pub sensor: Sensor,
     /// Share of the samples in which random regions of measured depth are hidden, 0 to 1.
     pub hide: f32,
+    /// Every sample has the lens of its camera model; else each one is a little off it.
+    pub nominal_lens: bool,
     /// Families of objects.
     pub families: Vec<Family>,
     /// Meshes for [`Family::Mesh`].
@@ -89,6 +91,7 @@ impl Default for Settings {
             cameras: vec!["d435".to_owned()],
             sensor: Sensor::Statistical,
             hide: 0.0,
+            nominal_lens: false,
             families: Family::ALL.into_iter().filter(|f| *f != Family::Mesh).collect(),
             meshes: Vec::new(),
         }
@@ -194,7 +197,8 @@ impl Generator {
         let model = self.models[(number % self.models.len() as u64) as usize];
         let model = &varied(model, &mut Draw::new(seed, number, 5));
         let RandomWorld { world, kind, families, camera_pose } = RandomWorld::new(seed, number, &self.stock);
-        let optics = Optics::new(model, seed, number, (width, height));
+        let off = if self.settings.nominal_lens { 0.0 } else { 1.0 };
+        let optics = Optics::new(model, off, seed, number, (width, height));
         let noise = mix(seed ^ mix(number.wrapping_add(0x5CE4E)));
 
         let rays = Rays::new(&optics.color, width, height);
@@ -281,7 +285,7 @@ fn register(optics: &Optics, model: &Model, size: (u32, u32), sensed: &[u16]) ->
     Ok(raw)
 }
 
-/// A sample's lenses: those of the model, a little off.
+/// A sample's lenses: those of the model, `off` times a little off.
 #[derive(Debug)]
 struct Optics {
     color: Intrinsics,
@@ -290,9 +294,9 @@ struct Optics {
 }
 
 impl Optics {
-    fn new(model: &Model, seed: u64, number: u64, size: (u32, u32)) -> Self {
+    fn new(model: &Model, off: f64, seed: u64, number: u64, size: (u32, u32)) -> Self {
         let rolls = super::noise::Rolls::new(seed, number as u32, (number >> 32) as u32, 2);
-        let off = |i: u64, by: f64| (rolls.unit_f64(i) * 2.0 - 1.0) * by;
+        let off = |i: u64, by: f64| (rolls.unit_f64(i) * 2.0 - 1.0) * by * off;
         let color_mode = fitted(model.color_modes, size);
         // Depth of about the same height as colour.
         let depth_modes = model.depth_modes.iter().filter(|m| m.height >= size.1);

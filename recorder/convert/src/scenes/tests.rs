@@ -253,3 +253,51 @@ fn hidden_regions_are_holes_before_they_are_filled_and_the_record_has_their_shar
     assert!((15..=33).contains(&hidden), "{hidden} of 40");
     assert!(Generator::new(settings(1.5)).unwrap_err().to_string().contains("0..=1"));
 }
+
+#[test]
+fn a_dataset_has_a_world_each_set_and_one_lens() {
+    use depthrig_recorder::fs::RealFs;
+    use depthrig_recorder::{ColorCodec, Dataset, RecorderOptions, SetRange};
+    use std::ops::ControlFlow;
+    use std::sync::Arc;
+
+    let settings = Settings { nominal_lens: true, ..generator().settings().clone() };
+    let made = Generator::new(settings.clone()).unwrap();
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("random");
+    let mut sets = SceneSets::new(Generator::new(settings).unwrap(), 3, "random".into()).unwrap();
+    let options = RecorderOptions { color: ColorCodec::Raw, ..RecorderOptions::default() };
+    let report =
+        crate::import(&mut sets, Arc::new(RealFs), &out, options, &mut |_| ControlFlow::Continue(()));
+    assert_eq!(report.unwrap().facts.lost, 0);
+
+    let dataset = Dataset::open(&out).unwrap();
+    let names: Vec<String> = dataset.session().streams.iter().map(|s| s.id.to_string()).collect();
+    assert_eq!(names, ["d435/color", "d435/depth", "d435/depth_true_color"]);
+    let mut number = 0;
+    for set in dataset.sets(SetRange::default()) {
+        let set = set.unwrap();
+        let sample = made.sample(number).unwrap();
+        let units = |v: &[u16]| v.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
+        let expected = [sample.color, units(&sample.raw), units(&sample.truth)];
+        for (frame, pixels) in set.frames.iter().zip(&expected) {
+            assert_eq!(frame.pixels, *pixels, "set {number}, {}", names[frame.stream]);
+            assert_eq!(frame.header.intrinsics, sample.intrinsics);
+            assert_eq!(frame.header.capture_time_ns, number as i64 * 200_000_000);
+        }
+        assert_eq!(set.frames.len(), 3);
+        number += 1;
+    }
+    assert_eq!(number, 3);
+    // The default lens differs from one sample to the next.
+    assert_ne!(generator().sample(0).unwrap().intrinsics, generator().sample(1).unwrap().intrinsics);
+    let refused = |settings: Settings| {
+        let sets = SceneSets::new(Generator::new(settings).unwrap(), 3, "random".into());
+        sets.err().map(|e| e.to_string()).unwrap_or_default()
+    };
+    assert!(refused(generator().settings().clone()).contains("nominal"));
+    let two = vec!["d435".to_owned(), "l515".to_owned()];
+    assert!(
+        refused(Settings { cameras: two, nominal_lens: true, ..Settings::default() }).contains("d435,l515")
+    );
+}
