@@ -278,6 +278,8 @@ def test_errors_of_a_bucket_are_clear(binary: str, data: Path, tmp_path: Path, s
     # A server that denies.
     with answering(403, b"<Error><Code>AccessDenied</Code></Error>") as (address, _):
         assert "denies access; check AWS_ACCESS_KEY_ID" in fails("s3://lab/x", cloud(address))
+    with answering(301, b"") as (address, _):
+        assert "is in another region; correct AWS_REGION" in fails("s3://lab/x", cloud(address))
     # One that has a bad moment, again and again: a bounded number of tries.
     with answering(503, b"<Error><Code>SlowDown</Code></Error>") as (address, requests):
         fails("s3://lab/x", cloud(address))

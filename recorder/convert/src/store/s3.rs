@@ -292,11 +292,15 @@ impl Remote {
                 ErrorKind::PermissionDenied,
                 "there are no credentials; set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY".to_owned(),
             ),
+            _ if said.contains("redirect") || said.contains("AuthorizationHeaderMalformed") => (
+                ErrorKind::Io,
+                format!("the bucket {bucket} is in another region; correct AWS_REGION or AWS_ENDPOINT_URL"),
+            ),
             _ if said.contains("HTTP error") => (
                 ErrorKind::Io,
                 format!(
-                    "{endpoint} does not answer, {RETRIES} more tries included; check AWS_ENDPOINT_URL and the network, then \
-                     run it again"
+                    "{endpoint} does not answer, also when asked again; check AWS_ENDPOINT_URL and the network, then run it \
+                     again"
                 ),
             ),
             _ => (ErrorKind::Io, format!("{endpoint} refuses; run it again, or ask who runs it")),
