@@ -61,9 +61,11 @@ fn failure(e: ureq::Error) -> HttpError {
         BrokenPipe, ConnectionAborted, ConnectionRefused, ConnectionReset, TimedOut, UnexpectedEof,
     };
     let is_lost = match &e {
-        ureq::Error::HostNotFound | ureq::Error::ConnectionFailed | ureq::Error::Timeout(_) => true,
-        // An answer that ends before its head is complete.
-        ureq::Error::Protocol(_) => true,
+        // Protocol: an answer that ends before its head is complete.
+        ureq::Error::HostNotFound
+        | ureq::Error::ConnectionFailed
+        | ureq::Error::Timeout(_)
+        | ureq::Error::Protocol(_) => true,
         ureq::Error::Io(io) => matches!(
             io.kind(),
             BrokenPipe | ConnectionAborted | ConnectionRefused | ConnectionReset | TimedOut | UnexpectedEof

@@ -11,7 +11,7 @@ const UNFINISHED: &str =
 
 /// A dataset of the input.
 pub(super) enum Listed {
-    Usable(Usable),
+    Usable(Box<Usable>),
     Skipped(SkippedPiece),
 }
 
@@ -44,14 +44,14 @@ impl Listed {
         segments: Vec<(String, u64)>,
     ) -> Result<Self> {
         let session = dataset.session();
-        let is_unfinished =
-            session.outcome.is_none() || segments.iter().any(|(file, _)| file.ends_with(".part"));
+        let is_part = |file: &str| Path::new(file).extension().is_some_and(|e| e == "part");
+        let is_unfinished = session.outcome.is_none() || segments.iter().any(|(file, _)| is_part(file));
         if is_unfinished || segments.is_empty() {
             let why = if is_unfinished { UNFINISHED } else { "it has no segment" };
             return Ok(Self::skipped(name, why.to_owned()));
         }
         let session_crc32 = crc32fast::hash(session.to_toml()?.as_bytes());
-        Ok(Self::Usable(Usable { name, dataset, remote, segments, session_crc32 }))
+        Ok(Self::Usable(Box::new(Usable { name, dataset, remote, segments, session_crc32 })))
     }
 
     const fn skipped(dataset: String, why: String) -> Self {
