@@ -29,7 +29,7 @@ pub struct Part {
 }
 
 impl Source {
-    /// What is to be exported of `dataset`, as one source, or as one for each of its episodes, when it has any. Discarded episodes are
+    /// The parts of `dataset` to be exported, as one source, or as one for each of its episodes, when it has any. Discarded episodes are
     /// left out, and of single episodes those that were cut off. Reads the indexes of all segments; no set is read.
     ///
     /// # Errors
