@@ -36,7 +36,10 @@ fn each_used_episode_is_one_of_the_export_and_nothing_else_is() {
     let episode = |number: u32, from: i64, to: Option<i64>, more: &str| -> Episode {
         let end = to.map(|n| format!("end_utc_ns = {}\n", T0 + n * PERIOD)).unwrap_or_default();
         let start = T0 + from * PERIOD - 1;
-        toml::from_str(&format!("number = {number}\ntask = \"t{number}\"\nstart_utc_ns = {start}\n{end}{more}")).unwrap()
+        toml::from_str(&format!(
+            "number = {number}\ntask = \"t{number}\"\nstart_utc_ns = {start}\n{end}{more}"
+        ))
+        .unwrap()
     };
     session.episodes = vec![
         episode(1, 1, Some(3), ""),
@@ -75,6 +78,7 @@ fn each_used_episode_is_one_of_the_export_and_nothing_else_is() {
         (0..2).map(|i| calibration["episodes"][i]["episode"]["number"].as_u64().unwrap()).collect();
     assert_eq!(numbers, [1, 3]);
     // Whole recordings lack the discarded one alone.
-    let report = export_to("/folders", &mut ByteCameraExport::new(CameraNames::default(), None).unwrap()).unwrap();
+    let report =
+        export_to("/folders", &mut ByteCameraExport::new(CameraNames::default(), None).unwrap()).unwrap();
     assert_eq!(report.sets, 8);
 }
