@@ -363,13 +363,13 @@ pub struct StopRequest {
     pub mark: Option<Mark>,
 }
 
-/// What is to happen to an episode, a demonstration within a recording.
+/// Change of an episode, a demonstration within a recording.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "action", rename_all = "snake_case", deny_unknown_fields)]
 pub enum EpisodeRequest {
     /// One begins.
     Start {
-        /// What is to be done.
+        /// The task.
         #[serde(default)]
         task: String,
     },

@@ -68,6 +68,10 @@ impl Exporter for Lerobot {
         "lerobot"
     }
 
+    fn is_by_episode(&self) -> bool {
+        true
+    }
+
     fn options(&self) -> Value {
         json!(self.options)
     }

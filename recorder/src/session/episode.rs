@@ -15,7 +15,7 @@ const TASKS_MAX_BYTES: usize = 1 << 20;
 pub struct Episode {
     /// Its number in the recording, from 1.
     pub number: u32,
-    /// What was to be done.
+    /// The task.
     #[serde(default)]
     pub task: String,
     /// Its start, UTC nanoseconds since 1970 on the time axis of the sets.
@@ -81,7 +81,7 @@ impl EpisodeCounts {
     }
 }
 
-/// What happens to an episode at its end.
+/// Fate of an episode at its end.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum EpisodeEnd {
     /// It is kept, judged or not.
@@ -101,7 +101,7 @@ impl Episode {
         self.end_utc_ns.is_none()
     }
 
-    /// Whether exports have it: it is whole and was not discarded. One that was cut off is left out until somebody judges it.
+    /// Whether exports have it: it is complete and was not discarded. One that was cut off is left out until somebody judges it.
     pub const fn is_used(&self) -> bool {
         !self.discarded && (self.outcome.is_some() || (!self.is_open() && !self.is_cut()))
     }

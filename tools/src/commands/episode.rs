@@ -26,7 +26,7 @@ Examples:
 pub enum EpisodeCommand {
     /// Begin an episode
     Start {
-        /// What is to be done
+        /// Task
         #[arg(long, value_name = "TEXT", default_value = "")]
         task: String,
         /// Print JSON
