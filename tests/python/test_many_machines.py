@@ -571,6 +571,19 @@ def test_tiny_refines_segments_too(binary: str, data: Path, tmp_path: Path) -> N
         assert not (tmp_path / "bad").exists(), "nothing hinders the corrected command"
 
 
+def test_sets_of_discarded_episodes_are_refined_too(binary: str, data: Path, tmp_path: Path) -> None:  # noqa: F811
+    (dataset,) = data.iterdir()
+    source = tmp_path / "source"
+    subprocess.run(["cp", "-r", str(dataset), str(source)], check=True)
+    with (source / "session.toml").open("a") as session:
+        session.write(f"\n[[episodes]]\nnumber = 1\nstart_utc_ns = 0\nend_utc_ns = {1 << 62}\ndiscarded = true\n")
+    ended, report, why = relabel(binary, source, tmp_path / "out")
+    assert ended == 0, why
+    assert report["streams"][0]["frames"] == report["sets"] > 0
+    ended, _, why = code(binary, "cdm", "relabel", str(source), str(tmp_path / "copy"), "--engine", "fill")
+    assert ended == 0, why
+
+
 def test_what_cannot_be_refined_is_skipped_and_named(
     binary: str, runtime: Path, data: Path, tmp_path: Path  # noqa: F811
 ) -> None:

@@ -2,7 +2,7 @@
 
 use super::folder::{FolderState, OutFile, Output};
 use super::report::{ExportReport, PartRecord, StreamCount};
-use super::source::{PART_SETS, Part, Source};
+use super::source::{EpisodeUse, PART_SETS, Part, Source};
 use crossbeam::channel::{Sender, bounded};
 use depthrig_bus::sync::lock;
 use depthrig_recorder::fs::Fs;
@@ -23,9 +23,9 @@ pub trait Exporter: Sync {
     /// The name of the layout.
     fn format(&self) -> &'static str;
 
-    /// Whether each episode of a dataset is a source of its own.
-    fn is_by_episode(&self) -> bool {
-        false
+    /// The sets of a dataset with episodes that are exported.
+    fn episodes(&self) -> EpisodeUse {
+        EpisodeUse::Kept
     }
 
     /// The options that decide what is written, as recorded in `export.json`. A folder is resumed with equal ones only.
@@ -263,7 +263,7 @@ pub fn export(
         datasets.iter().filter_map(|d| d.filter().map(|f| f.name().to_owned())).collect();
     let mut sources = Vec::new();
     for dataset in datasets {
-        sources.extend(Source::all_of(dataset, exporter.is_by_episode())?);
+        sources.extend(Source::all_of(&dataset, exporter.episodes())?);
     }
     let plan = exporter.plan(&sources)?;
     let mut options_written = exporter.options();

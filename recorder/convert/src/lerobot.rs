@@ -14,7 +14,7 @@ mod schema;
 mod stats;
 mod table;
 
-use super::{Exporter, Output, Part, PartOut, PartSets, Parts, Plan, Source};
+use super::{EpisodeUse, Exporter, Output, Part, PartOut, PartSets, Parts, Plan, Source};
 use depthrig_bus::StreamId;
 use depthrig_recorder::{Error, ErrorKind, Result};
 use serde::Serialize;
@@ -68,8 +68,8 @@ impl Exporter for Lerobot {
         "lerobot"
     }
 
-    fn is_by_episode(&self) -> bool {
-        true
+    fn episodes(&self) -> EpisodeUse {
+        EpisodeUse::Each
     }
 
     fn options(&self) -> Value {

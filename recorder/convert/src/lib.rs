@@ -38,4 +38,4 @@ pub use import::{ImportFacts, ImportProgress, ImportReport, Importer, import};
 pub use report::{DatasetIdentity, ExportReport, PartRecord, REPORT_FILE, SegmentIdentity, StreamCount};
 pub use rosbag::RosbagImport;
 pub use run_part::RunPart;
-pub use source::{PART_SETS, Part, Source};
+pub use source::{EpisodeUse, PART_SETS, Part, Source};

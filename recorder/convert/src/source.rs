@@ -9,12 +9,24 @@ use std::ops::Range;
 /// for it costs nothing.
 pub const PART_SETS: usize = 100;
 
+/// The sets of a dataset with episodes that an export takes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum EpisodeUse {
+    /// All of them.
+    All,
+    /// Those that are in no discarded episode.
+    Kept,
+    /// Those of each used episode, as a source of its own.
+    Each,
+}
+
 /// A dataset to be exported, or one episode of it.
 pub struct Source {
     dataset: Dataset,
     reader: SetReader,
     /// Numbers of the sets to be exported.
     spans: Vec<Range<usize>>,
+    takes: EpisodeUse,
     episode: Option<Episode>,
     is_first: bool,
 }
@@ -29,14 +41,14 @@ pub struct Part {
 }
 
 impl Source {
-    /// The parts of `dataset` to be exported, as one source, or as one for each of its episodes, when it has any. Discarded episodes are
-    /// left out, and of single episodes those that were cut off. Reads the indexes of all segments; no set is read.
+    /// The parts of `dataset` to be exported, as one source, or as one for each of its episodes, when it has any. Of single episodes
+    /// those that were cut off are left out. Reads the indexes of all segments; no set is read.
     ///
     /// # Errors
     /// [`ErrorKind::Io`] when the disk cannot be read, [`ErrorKind::BadInput`] when the dataset has episodes and none is left.
-    pub fn all_of(dataset: Dataset, by_episode: bool) -> Result<Vec<Self>> {
+    pub fn all_of(dataset: &Dataset, takes: EpisodeUse) -> Result<Vec<Self>> {
         let reader = dataset.set_reader()?;
-        let episodes = dataset.session().episodes.clone();
+        let episodes = if takes == EpisodeUse::All { Vec::new() } else { dataset.session().episodes.clone() };
         let all = 0..reader.times().len();
         let numbers = |e: &Episode| {
             let times = reader.times();
@@ -45,7 +57,7 @@ impl Source {
         };
         let spans: Vec<(Vec<Range<usize>>, Option<Episode>)> = if episodes.is_empty() {
             vec![(vec![all], None)]
-        } else if by_episode {
+        } else if takes == EpisodeUse::Each {
             let used = episodes.iter().filter(|e| e.is_used()).map(|e| (vec![numbers(e)], Some(e.clone())));
             used.filter(|(spans, _)| !spans[0].is_empty()).collect()
         } else {
@@ -66,6 +78,7 @@ impl Source {
             dataset: dataset.clone(),
             reader: reader.fork(),
             spans,
+            takes,
             episode,
             is_first: i == 0,
         };
@@ -89,6 +102,9 @@ impl Source {
 
     /// Which episodes and sets of its dataset are left out, in words; `None` for none.
     pub fn left_out(&self) -> Option<String> {
+        if self.takes == EpisodeUse::All {
+            return None;
+        }
         let session = self.session();
         let is_out = |e: &&Episode| if self.episode.is_some() { !e.is_used() } else { e.discarded };
         let mut left: Vec<_> = session

@@ -1,7 +1,7 @@
 //! Refines every image of a dataset into files, a few sets in each: a killed run goes on with them.
 
 use super::{Camera, Engine, RelabelOptions, cannot};
-use crate::{Exporter, Output, Part, PartOut, PartSets, Parts, Plan, Source};
+use crate::{EpisodeUse, Exporter, Output, Part, PartOut, PartSets, Parts, Plan, Source};
 use depthrig_bus::sync::lock;
 use depthrig_bus::{FrameHeader, files};
 use depthrig_cdm::stage::Refiners;
@@ -61,6 +61,11 @@ fn file_name(first: usize) -> String {
 impl Exporter for Refine<'_> {
     fn format(&self) -> &'static str {
         "refined depth"
+    }
+
+    /// The copy has the episodes, too.
+    fn episodes(&self) -> EpisodeUse {
+        EpisodeUse::All
     }
 
     fn options(&self) -> Value {
