@@ -311,19 +311,16 @@ impl Recording {
     /// one, `BadInput` for a task that is too long.
     pub fn episode(&mut self, request: &EpisodeRequest) -> Result<Episode> {
         let recorder = &self.active.as_ref().ok_or_else(none_active)?.recorder;
-        let is_running = || recorder.progress().episodes.last.is_some_and(|e| e.is_open());
+        let is_running = recorder.progress().episodes.last.is_some_and(|e| e.is_open());
         let done = match request {
             EpisodeRequest::Start { task } => recorder.start_episode(task.trim()),
-            EpisodeRequest::Stop { .. } if !is_running() => {
+            EpisodeRequest::Stop { .. } if !is_running => {
                 return Err(Error::new(
                     ErrorKind::WrongState,
                     "no episode is running; start one with: depthrig episode start",
                 ));
             }
             EpisodeRequest::Stop { outcome } => recorder.end_episode(EpisodeEnd::Kept(*outcome)),
-            EpisodeRequest::Discard { number: None } if is_running() => {
-                recorder.end_episode(EpisodeEnd::Discarded)
-            }
             EpisodeRequest::Discard { number } => recorder.judge_episode(*number, EpisodeEnd::Discarded),
             EpisodeRequest::Mark { outcome, number } => {
                 recorder.judge_episode(*number, EpisodeEnd::Kept(*outcome))

@@ -398,12 +398,21 @@ impl Recorder {
         self.change_episode(|session, now| session.end_episode(end, now))
     }
 
-    /// Judges an episode, by default the last one that has ended.
+    /// Judges an episode, by default the last one that has ended. One that runs can only be discarded, which ends it; without a
+    /// number it is the one that is discarded.
     ///
     /// # Errors
-    /// [`ErrorKind::NotFound`] when it is unknown.
+    /// [`ErrorKind::NotFound`] when it is unknown, [`ErrorKind::InUse`] when it runs.
     pub fn judge_episode(&self, number: Option<u32>, end: EpisodeEnd) -> Result<Episode> {
-        self.change_episode(|session, _| session.judge_episode(number, end))
+        self.change_episode(|session, now| match session.running().map(|e| e.number) {
+            Some(n) if end == EpisodeEnd::Discarded && number.is_none_or(|number| number == n) => {
+                session.end_episode(end, now)
+            }
+            Some(n) if number == Some(n) => {
+                Err(Error::new(ErrorKind::InUse, format!("episode {n} is running; stop it first")))
+            }
+            _ => session.judge_episode(number, end),
+        })
     }
 
     /// Changes an episode; the change is in `session.toml` within the second.

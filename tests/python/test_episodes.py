@@ -10,6 +10,7 @@ from pathlib import Path
 
 import depthrig
 import pyarrow.parquet as pq
+import pytest
 from mcap.reader import make_reader
 from test_daemon import WAIT_S, binary, command, environment, rig_file, running, runtime
 
@@ -119,3 +120,46 @@ def test_demonstrations_survive_a_kill_and_become_episodes_of_lerobot(
     rows = [r for f in sorted(again.rglob("data/**/*.parquet")) for r in pq.read_table(f).to_pylist()]
     last = [t for t in times if t >= info["episodes"][3]["start_utc_ns"]]
     assert [r["capture.utc_ns"] for r in rows if r["episode_index"] == 1] == last
+
+
+def test_a_python_program_steers_its_recording_and_episodes(
+    binary: str,  # noqa: F811
+    runtime: Path,  # noqa: F811
+    rig_file: Path,  # noqa: F811
+    tmp_path: Path,
+) -> None:
+    with pytest.raises(depthrig.RigNotRunning):
+        depthrig.Recording(runtime_dir=runtime)
+    # 3: intact, but a busy computer may lose a set.
+    with running(binary, runtime, tmp_path / "log", "run", str(rig_file), codes=(0, 3)):
+        with depthrig.Stream("lingbot_0/depth", runtime_dir=runtime, timeout=WAIT_S) as stream:
+            stream.next(timeout=WAIT_S)
+        recording = depthrig.Recording(runtime_dir=runtime)
+        assert (recording.rig, recording.status()) == ("images", None)
+        with pytest.raises(depthrig.RigRefused, match="no recording is going on") as refusal:
+            recording.start_episode()
+        assert refusal.value.kind == "wrong_state"
+
+        started = recording.start(scene="kitchen", notes="by a program", name="python")
+        recording.note("the lamp is on")
+        with recording.episode(TASK) as first:
+            with pytest.raises(depthrig.RigRefused, match="episode 1 is running"):
+                recording.start_episode()
+            wait_for_sets(binary, runtime, 1)
+        assert (first.number, first.task, first.end_utc_ns) == (1, TASK, None)
+        with pytest.raises(KeyError), recording.episode("fails"):
+            raise KeyError
+        with pytest.raises(depthrig.RigRefused, match="unknown episode 7"):
+            recording.mark_episode("success", 7)
+        with pytest.raises(depthrig.RigRefused):
+            recording.mark_episode("perhaps")
+        assert recording.mark_episode("success", 1).outcome == "success"
+        ended = recording.stop()
+        assert (ended["episodes"], ended["episodes_discarded"]) == (1, 1)
+        assert ended["path"] == started["path"]
+    gone = recording
+    with pytest.raises(depthrig.RigNotRunning):
+        gone.status()
+    info = json.loads(command(binary, runtime, "info", str(started["path"]), "--json", codes=(0, 3)))
+    states = [(e.get("outcome"), e.get("discarded", False)) for e in info["episodes"]]
+    assert states == [("success", False), (None, True)]

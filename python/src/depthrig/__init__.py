@@ -26,6 +26,7 @@ from ._layout import (
     SignalFlags,
     StageStep,
 )
+from ._recording import Episode, Recording
 from ._runtime import running_rigs
 from ._sets import FrameSet, Sets
 from ._signal import Signal, signals
@@ -43,6 +44,7 @@ from .errors import (
     DepthrigError,
     HoldingTooMany,
     RigNotRunning,
+    RigRefused,
     SignalChanged,
     SignalGap,
     SignalNotFound,
@@ -69,6 +71,7 @@ __all__ = [
     "DepthrigError",
     "Distortion",
     "DropReason",
+    "Episode",
     "ExternalCamera",
     "ExternalClock",
     "ExternalMode",
@@ -85,8 +88,10 @@ __all__ = [
     "MotionFlags",
     "PixelFormat",
     "Pose",
+    "Recording",
     "Refinement",
     "RigNotRunning",
+    "RigRefused",
     "SetReader",
     "Sets",
     "Signal",

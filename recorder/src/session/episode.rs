@@ -152,7 +152,8 @@ impl Episode {
 }
 
 impl Session {
-    fn running(&mut self) -> Option<&mut Episode> {
+    /// The episode that runs.
+    pub(crate) fn running(&mut self) -> Option<&mut Episode> {
         self.episodes.last_mut().filter(|e| e.is_open())
     }
 

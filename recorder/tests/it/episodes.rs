@@ -81,12 +81,20 @@ fn the_end_of_a_recording_ends_its_episode_and_judgements_can_change_while_it_go
     assert!(!r.judge_episode(Some(1), SUCCESS).unwrap().discarded);
     let unknown = r.judge_episode(Some(7), SUCCESS).unwrap_err();
     assert!(unknown.to_string().contains("episode 7"), "{unknown}");
+    r.start_episode("dropped").unwrap();
+    assert_eq!(r.judge_episode(Some(2), SUCCESS).unwrap_err().kind(), ErrorKind::InUse);
+    let dropped = r.judge_episode(Some(2), EpisodeEnd::Discarded).unwrap();
+    assert!(dropped.discarded && !dropped.is_open());
+    r.start_episode("").unwrap();
+    assert_eq!(r.judge_episode(None, EpisodeEnd::Discarded).unwrap().number, 3);
     r.start_episode("to the end").unwrap();
     let counts = r.progress().episodes;
-    assert_eq!((counts.kept, counts.discarded, counts.last.unwrap().number), (1, 0, 2));
+    assert_eq!((counts.kept, counts.discarded, counts.last.unwrap().number), (1, 2, 4));
     r.push(set(&session(), 0)).unwrap();
     r.finish().unwrap();
-    assert_eq!(states(&open(&fs).session().episodes), [(1, "success", true), (2, "kept", true)]);
+    let states = states(&open(&fs).session().episodes);
+    assert_eq!((states[0], states[3]), ((1, "success", true), (4, "kept", true)));
+    assert!(states[1..3].iter().all(|(_, state, _)| *state == "discarded"));
 }
 
 fn episode(number: u32, from: i64, to: i64) -> Episode {

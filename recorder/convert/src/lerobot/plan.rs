@@ -48,11 +48,10 @@ const STEP_NS: i64 = 100_000;
 /// How often two rows that follow each other were this far apart, in steps of [`STEP_NS`].
 type Steps = BTreeMap<i64, u64>;
 
-fn steps(source: &Source, episode: &Episode) -> Steps {
+fn steps(times: impl Iterator<Item = i64>) -> Steps {
     let mut steps = Steps::new();
-    let kept = source.numbers().filter(|n| episode.row_of(*n).is_some()).map(|n| source.times()[n]);
     let mut last = None;
-    for t in kept {
+    for t in times {
         if let Some(last) = last.replace(t) {
             *steps.entry((t - last) / STEP_NS).or_default() += 1;
         }
@@ -135,8 +134,11 @@ impl Plan {
             });
             let first = source.numbers().next().unwrap_or_default();
             let episode = Episode { task, first_row, rows, first, left_out };
-            let steps = steps(source, &episode);
-            let here = options.fps.or_else(|| rate(source, &steps)).unwrap_or(1.0);
+            let times = source.times();
+            let kept = steps(source.numbers().filter(|n| episode.row_of(*n).is_some()).map(|n| times[n]));
+            // An episode may have too few sets to know a rate from.
+            let of_rate = if source.episode().is_some() { &steps(times.iter().copied()) } else { &kept };
+            let here = options.fps.or_else(|| rate(source, of_rate)).unwrap_or(1.0);
             let fps = *fps.get_or_insert(here);
             if (here / fps - 1.0).abs() > 1e-3 {
                 return Err(bad(format!(
@@ -150,7 +152,7 @@ impl Plan {
                 let n = episode.left_out.len();
                 plan.losses.push(format!("{session}: {n} sets that lack a frame are left out"));
             }
-            let (gaps, missing) = gaps(&steps, fps);
+            let (gaps, missing) = gaps(&kept, fps);
             if gaps > 0 {
                 plan.losses.push(format!(
                     "{session}: {gaps} gaps in time ({missing} sets) are closed by the even grid of timestamp; \

@@ -44,7 +44,7 @@ fn each_used_episode_is_one_of_the_export_and_nothing_else_is() {
     session.episodes = vec![
         episode(1, 1, Some(3), ""),
         episode(2, 4, Some(5), "discarded = true"),
-        episode(3, 6, Some(7), "outcome = \"failure\""),
+        episode(3, 6, Some(6), "outcome = \"failure\""),
         episode(4, 8, None, ""),
     ];
     let r = Recorder::create(Arc::new(fs.clone()), &dir(), session.clone(), options()).unwrap();
@@ -66,10 +66,10 @@ fn each_used_episode_is_one_of_the_export_and_nothing_else_is() {
         export(&fs, exporter, vec![open(&fs)], Path::new(out), ExportOptions::default(), on)
     };
     let report = export_to("/export", &mut Lerobot::new(LerobotOptions::default())).unwrap();
-    // Sets 1 to 3, and 6 and 7.
-    assert_eq!((report.sets, report.frames, report.lost), (5, 15, 0));
+    // Sets 1 to 3, and 6.
+    assert_eq!((report.sets, report.frames, report.lost), (4, 12, 0));
     assert_eq!(report.datasets.len(), 1);
-    assert_eq!((report.streams.len(), report.streams[1].frames), (3, 5));
+    assert_eq!((report.streams.len(), report.streams[1].frames), (3, 4));
     let said = report.losses.join("\n");
     assert!(said.contains("episode 2 (discarded), episode 4 (running or cut off)"), "{said}");
     let text = contents(&fs, Path::new("/export/calibration.json"));
