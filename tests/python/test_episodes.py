@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import time
@@ -12,7 +13,7 @@ import depthrig
 import pyarrow.parquet as pq
 import pytest
 from mcap.reader import make_reader
-from test_daemon import WAIT_S, binary, command, environment, rig_file, running, runtime
+from test_daemon import ROOT, WAIT_S, binary, command, environment, rig_file, running, runtime
 
 __all__ = ["binary", "rig_file", "runtime"]
 
@@ -154,9 +155,17 @@ def test_a_python_program_steers_its_recording_and_episodes(
         with pytest.raises(depthrig.RigRefused):
             recording.mark_episode("perhaps")
         assert recording.mark_episode("success", 1).outcome == "success"
-        ended = recording.stop()
-        assert (ended["episodes"], ended["episodes_discarded"]) == (1, 1)
-        assert ended["path"] == started["path"]
+        # As the documents have it.
+        text = (ROOT / "docs" / "demonstrations.md").read_text().partition("\n## Episodes\n")[2]
+        (code,) = [block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "Recording()" in block]
+        code = code.replace("Recording()", "Recording(runtime_dir=folder)")
+        recording.stop()
+        exec(code, {"depthrig": depthrig, "time": time, "folder": runtime})
+        judged = recording.status()
+        assert judged is not None
+        assert (judged["active"], judged["episodes"], judged["episode"]["outcome"]) == (False, 1, "success")
+        ended = json.loads(command(binary, runtime, "info", str(started["path"]), "--json", codes=(0, 3)))
+        assert [e["number"] for e in ended["episodes"]] == [1, 2]
     gone = recording
     with pytest.raises(depthrig.RigNotRunning):
         gone.status()
