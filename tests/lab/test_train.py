@@ -321,7 +321,7 @@ def test_the_loss_beside_fill_is_its_definition() -> None:
         change = now - before
         losses_of.append(change / (before + 0.1) + 2 * max(change, 0) / (before + 0.01))
     assert min(losses_of) < -0.1
-    assert max(losses_of) > 0.1
+    assert max(losses_of) > 0.05
     of = [torch.from_numpy(a) for a in (p, t, filled)]
     of[0].requires_grad_()
     got = losses.beside_fill_loss(*of, c)
