@@ -67,10 +67,10 @@ steps = $steps
 batch = 8
 crop = [160, 208]
 ema = 0.99
-loss.missing = 2.0
+loss.space = "fill"
 check_samples = 16
 TOML
-"$root/tools/python.sh" run-lab torch.distributed.run --nproc-per-node 2 -m depthrig.lab.train "$out/train.toml"
+"$root/tools/python.sh" run-lab torch.distributed.run --standalone --nproc-per-node 2 -m depthrig.lab.train "$out/train.toml"
 
 step "evaluation on families of objects that training never saw"
 "$depthrig" eval held-out --refine fill --refine tiny --refine lab-demo=run/tiny.onnx --out held-out.html

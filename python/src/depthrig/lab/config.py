@@ -37,7 +37,7 @@ class ModelConfig:
     """`tiny`, `cdm` (the official form), `hole` or `value` (noise models of a camera)."""
     encoder: str = "vits"
     """Encoder of `cdm`, `hole` and `value`: `vits`, `vitb` or `vitl`."""
-    width: int = 32
+    width: int = 48
     """Channels of the first stage of `tiny`."""
     weights: str | None = None
     """State to begin with: a file of `torch.save(net.state_dict())`. Names that it lacks stay as they are drawn."""
@@ -101,16 +101,20 @@ class LossConfig:
     """The loss."""
 
     space: str = "inverse"
-    """Errors are of `inverse` depth, 1/m, or of its logarithm (`log`), in which near and far count alike."""
+    """Errors are of `inverse` depth, 1/m, of its logarithm (`log`), in which near and far count alike, or of depth as a
+    part of filled depth's error in that image (`fill`; `tiny` alone, without the two weights below)."""
     gradient: float = 0.5
     """Weight of the difference of gradients; the paper prints 1, PromptDA has 0.5."""
     missing: float = 1.0
     """Weight of a pixel whose raw depth is missing or wrong by more than 5 %, relative to one that was measured."""
+    worse: float = 1.0
+    """`fill`: weight of how much worse an image became."""
     near_m: float = 0.1
     far_m: float = 6.0
 
     def __post_init__(self) -> None:
-        _one_of("space", self.space, ("inverse", "log"))
+        _one_of("space", self.space, ("inverse", "log", "fill"))
+        _within("worse", self.worse, 0, 100)
         _within("gradient", self.gradient, 0, 100)
         _within("missing", self.missing, 0.01, 100)
         _within("near_m", self.near_m, 0.01, 100)
@@ -196,6 +200,8 @@ class Config:
             raise LabError(
                 f"crop = {list(self.train.crop)} are not multiples of {multiple}, as {self.model.kind} needs"
             )
+        if self.train.loss.space == "fill" and self.model.kind != "tiny":
+            raise LabError(f'loss.space = "fill" is for tiny alone; use "inverse" or "log" for {self.model.kind}')
         if self.train.flip and self.synthesis.sensor != "tof":
             raise LabError('flip = true needs sensor = "tof": a stereo camera misses what lies left of things')
 
