@@ -8,7 +8,7 @@ use crate::progress::Progress;
 use crate::signals::Stop;
 use anyhow::{Result, bail};
 use clap::ValueEnum;
-use depthrig_convert::scenes::{self, Plan, contact_sheet};
+use depthrig_convert::scenes::{self, Plan, contact_sheet, write_world};
 use depthrig_sim::synthetic::scenes::{Family, Generator, Sensor, Settings, TriangleMesh, Triplet};
 use std::path::{Path, PathBuf};
 
@@ -20,6 +20,9 @@ same without holes (as the refiner fill fills them), and the material of each pi
 A sample depends on the arguments, the seed and its number alone. A shard has its name once it is complete; a run that
 was interrupted goes on where it was. --shard 0/4 makes the first of four parts, on this computer or another one.
 
+--worlds DIR writes each world of the run as a folder DIR/NUMBER: meshes (PLY) with colours, camera, lamps, and what
+the camera sees.
+
 Families: box, ball, superquadric, cup, bottle, bowl, plate, cutlery, cable, cloth, and mesh with --meshes.
 Cameras: d405, d415, d435, d455, l515, zed2i, kinect, generic.
 
@@ -30,13 +33,14 @@ Examples:
   depthrig scenes --seed 8 --count 500 --without bottle,cup --out train
   depthrig scenes --count 20000 --hide 0.5 --out train
   depthrig scenes --count 20000 --sensor stereo --shard 2/8 --out train
-  depthrig scenes --count 12 --preview sheet.png";
+  depthrig scenes --count 12 --preview sheet.png
+  depthrig scenes --count 8 --size 320x240 --worlds worlds";
 
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct ScenesArgs {
     /// Folder of the shards
-    #[arg(long, value_name = "DIR", required_unless_present = "preview")]
+    #[arg(long, value_name = "DIR", required_unless_present_any = ["preview", "worlds"])]
     out: Option<PathBuf>,
     /// Seed of the run
     #[arg(long, value_name = "N", default_value_t = 0)]
@@ -53,6 +57,9 @@ pub struct ScenesArgs {
     /// Share of the samples in which random regions of measured depth are hidden, 0 to 1
     #[arg(long, value_name = "SHARE", default_value_t = 0.0)]
     hide: f32,
+    /// Number of the measurement: another one draws sensor and noise anew, of the same worlds
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    again: u64,
     /// Width and height of the images, pixels
     #[arg(long, value_name = "WxH", default_value = "640x480", value_parser = size)]
     size: [u32; 2],
@@ -77,6 +84,9 @@ pub struct ScenesArgs {
     /// Image of the first samples: colour, true and measured depth
     #[arg(long, value_name = "FILE")]
     preview: Option<PathBuf>,
+    /// Folder for the worlds as meshes, for other renderers
+    #[arg(long, value_name = "DIR")]
+    worlds: Option<PathBuf>,
     #[command(flatten)]
     overwrite: Overwrite,
     /// Threads [default: all cores]
@@ -133,6 +143,16 @@ pub fn run(args: &ScenesArgs, context: &Context) -> Result<Exit> {
         }
         bar.clear();
         preview.write(&contact_sheet(&samples, generator.settings())?)?;
+    }
+    if let Some(folder) = &args.worlds {
+        for number in 0..args.count {
+            bar.set("writing worlds", number, args.count);
+            write_world(&generator.world(number), generator.settings(), folder)?;
+            if stop.is_asked() {
+                bail!("interrupted after {} worlds", number + 1);
+            }
+        }
+        bar.clear();
     }
     let Some(folder) = &args.out else { return Ok(Exit::Good) };
     let cores = || std::thread::available_parallelism().map_or(1, usize::from);
@@ -192,6 +212,7 @@ fn settings(args: &ScenesArgs) -> Result<Settings> {
             SensorName::Stereo => Sensor::Stereo,
         },
         hide: args.hide,
+        again: args.again,
         families: all.into_iter().filter(|f| !args.without.contains(f)).collect(),
         meshes,
     })

@@ -22,6 +22,21 @@ fn a_sample_depends_on_seed_and_number_alone() {
     assert_ne!(generator.sample(7).unwrap().truth, fifth.truth);
 }
 
+#[test]
+fn another_measurement_is_of_the_same_world_and_not_the_same() {
+    for sensor in [Sensor::Statistical, Sensor::Stereo] {
+        let made = |again| {
+            Generator::new(Settings { again, sensor, ..settings(&["d435"]) }).unwrap().sample(4).unwrap()
+        };
+        let [first, second, third] = [made(0), made(1), made(2)];
+        assert_eq!((&first.color, &first.truth), (&second.color, &second.truth), "{sensor:?}");
+        assert_eq!(second, made(1));
+        let differ = |a: &Triplet, b: &Triplet| a.raw.iter().zip(&b.raw).filter(|(a, b)| a != b).count();
+        let pixels = first.raw.len();
+        assert!(differ(&first, &second) * 10 > pixels && differ(&second, &third) * 10 > pixels, "{sensor:?}");
+    }
+}
+
 /// Share of holes, and median error in metres of what was measured, by material.
 fn quality(samples: &[Triplet], material: u8) -> (f64, f64) {
     let mut holes = 0;
