@@ -33,6 +33,8 @@ MARGIN = 1.1
 # Microfacets about as wide as the highlights of our caster (exponents 70 and 180).
 GLOSSY_ALPHA, METAL_ALPHA = 0.16, 0.1
 GLASS_IOR = 1.5
+WINDOW = 5
+"""Colour is compared in means over so many pixels, squared."""
 
 
 def bsdf(part: dict[str, Any], color: Any) -> dict[str, Any]:
@@ -49,7 +51,8 @@ def bsdf(part: dict[str, Any], color: Any) -> dict[str, Any]:
         metal = {"type": "roughconductor", "material": "none", "alpha": METAL_ALPHA, "specular_reflectance": body}
         return {"type": "twosided", "bsdf": metal}
     if surface == "glossy":
-        return {"type": "twosided", "bsdf": {"type": "roughplastic", "alpha": GLOSSY_ALPHA, "diffuse_reflectance": body}}
+        varnished = {"type": "principled", "base_color": body, "roughness": math.sqrt(GLOSSY_ALPHA), "specular": 0.5}
+        return {"type": "twosided", "bsdf": varnished}
     return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": body}}
 
 
@@ -153,15 +156,33 @@ def render(scene: Any, camera: Camera, spp: int, seed: int) -> Any:
     return out / 4
 
 
-def develop(light: Any, world: dict[str, Any], gain: float) -> Any:
+def calm(image: Any) -> Any:
+    """Return the means over `WINDOW` squared pixels, in which the noise of few paths is small."""
+    half = WINDOW // 2
+    padded = np.pad(image, ((half, half), (half, half), (0, 0)), mode="edge")
+    height, width = image.shape[:2]
+    return sum(padded[y : y + height, x : x + width] for y in range(WINDOW) for x in range(WINDOW)) / WINDOW**2
+
+
+def light_of(developed: Any, world: dict[str, Any]) -> Any:
+    """Return the light that `develop` made an image of, with gain 1; 0 to 4."""
+    levels = np.linspace(0, 1, 4096) ** 2 * 4
+    factors = np.array(world["white"]) * world["exposure"]
+    return np.interp(developed, _curve(levels), levels) / factors
+
+
+def develop(light: Any, world: dict[str, Any], gain: float = 1.0) -> Any:
     """Return 0 to 1 of linear light: the tone curve of our caster (`color.rs`)."""
-    x = np.clip(light * np.array(world["white"]) * world["exposure"] * gain, 0, 4)
+    return _curve(np.clip(light * np.array(world["white"]) * world["exposure"] * gain, 0, 4))
+
+
+def _curve(x: Any) -> Any:
     film = (x * (2.51 * x + 0.03)) / (x * (2.43 * x + 0.59) + 0.14)
     return np.clip(np.where(film <= 0.0031308, 12.92 * film, 1.055 * np.maximum(film, 1e-9) ** (1 / 2.4) - 0.055), 0, 1)
 
 
-def matched(light: Any, ours: Any, world: dict[str, Any]) -> tuple[Any, float]:
-    """Return the developed image whose mean is that of ours, and its gain."""
+def matched(light: Any, ours: Any, world: dict[str, Any]) -> float:
+    """Return the gain with which developed light has the mean of `ours`."""
     low, high = 1e-3, 1e3
     for _ in range(40):
         gain = math.sqrt(low * high)
@@ -169,7 +190,7 @@ def matched(light: Any, ours: Any, world: dict[str, Any]) -> tuple[Any, float]:
             low = gain
         else:
             high = gain
-    return develop(light, world, gain), gain
+    return gain
 
 
 def edges(part: Any) -> Any:
@@ -196,9 +217,11 @@ def compare(folder: Path, out: Path, spp: int) -> dict[str, Any]:
     off = np.abs(depth - truth)[same]
     inner = known & ~edges(part)
     light = render(scene_of(folder, world, lamps=True), camera, spp, world["number"])
-    theirs, gain = matched(light, ours, world)
+    ours = develop(calm(light_of(ours, world)), world)
+    gain = matched(calm(light), ours, world)
+    theirs = develop(calm(light), world, gain)
     apart = np.abs(theirs - ours).mean(-1)
-    Image.fromarray((255 * theirs + 0.5).astype(np.uint8)).save(out / f"{folder.name}.png")
+    Image.fromarray((255 * develop(light, world, gain) + 0.5).astype(np.uint8)).save(out / f"{folder.name}.png")
     of = {}
     for number, name in enumerate(MATERIALS):
         chosen = material == number

@@ -37,7 +37,7 @@ __all__ = ["Counts", "main", "measure", "shadow"]
 
 BINS = 256
 TRAINED_ON = 200
-"""Samples of the training data by which thresholds are chosen."""
+"""Samples of the training data by which thresholds are chosen and which the mean map is of."""
 
 Scores = npt.NDArray[np.float32]
 
@@ -121,12 +121,12 @@ def model_score(config: Config) -> Callable[[Sample], Scores]:
     return score
 
 
-def mean_map(source: Source) -> Scores:
-    """Return the share of the images of a dataset that have a hole at a pixel which the sensor can see."""
+def mean_map(samples: Sequence[Sample]) -> Scores:
+    """Return the share of the images that have a hole at a pixel, of those whose sensor can see it."""
     holes: Any = 0
     seen_sum: Any = 0
-    for i in range(len(source)):
-        hole, seen = _holes(source[i])
+    for sample in samples:
+        hole, seen = _holes(sample)
         holes, seen_sum = holes + (hole & seen), seen_sum + seen.astype(np.int64)
     return np.asarray(holes / np.maximum(seen_sum, 1), np.float32)
 
@@ -151,7 +151,8 @@ def measure(config: Config, again: Sequence[Source] = ()) -> dict[str, Any]:
     if not config.check:
         raise LabError("no [[check]]: held-out data are needed")
     trained, held_out = open_source(config.data[0]), open_source(config.check[0])
-    seen_map = mean_map(trained)
+    known = _some(trained, TRAINED_ON)
+    seen_map = mean_map(known)
     learned = model_score(config)
     fb = config.synthesis.focal_baseline
 
@@ -167,7 +168,7 @@ def measure(config: Config, again: Sequence[Source] = ()) -> dict[str, Any]:
         "occlusion of the true depth": lambda s: shadow(s.need_truth(), fb * s.color.shape[1] / 640),
     }
     train_counts, counts = ({name: Counts() for name in predictors} for _ in range(2))
-    for sample in _some(trained, TRAINED_ON):
+    for sample in known:
         hole, seen = _holes(sample)
         for name, predictor in predictors.items():
             train_counts[name].add(predictor(sample), hole, seen)

@@ -92,7 +92,12 @@ pub fn write_world(world: &WorldModel, settings: &Settings, folder: &Path) -> Re
             .parts
             .iter()
             .enumerate()
-            .map(|(i, p)| Part { file: name(i), surface: p.surface, material: p.material, infrared: p.infrared })
+            .map(|(i, p)| Part {
+                file: name(i),
+                surface: p.surface,
+                material: p.material,
+                infrared: p.infrared,
+            })
             .collect(),
     };
     let json = serde_json::to_vec_pretty(&record)

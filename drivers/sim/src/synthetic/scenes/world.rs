@@ -5,8 +5,8 @@ use super::super::scene::World;
 use super::super::shape::Triangles;
 use super::super::texture::{Paint, Surface};
 use super::super::view::{NOTHING, Rays, View};
-use super::{Generator, TRUTH_UNIT_M, material_of, mix};
 use super::{Draw, Optics, RandomWorld, depth, varied};
+use super::{Generator, TRUTH_UNIT_M, material_of, mix};
 use depthrig_bus::Intrinsics;
 use depthrig_calib::PoseExt;
 use glam::{Mat3, Vec3};
@@ -171,7 +171,13 @@ fn parts(world: &World, from: &Viewpoint) -> Vec<WorldPart> {
     things.chain(room).collect()
 }
 
-fn part(made: &Triangles, center: Vec3, axes: Mat3, from: &Viewpoint, paint: impl Fn(Vec3) -> Paint) -> WorldPart {
+fn part(
+    made: &Triangles,
+    center: Vec3,
+    axes: Mat3,
+    from: &Viewpoint,
+    paint: impl Fn(Vec3) -> Paint,
+) -> WorldPart {
     let first = paint(made.normals.first().copied().unwrap_or(Vec3::Z));
     let mut part = WorldPart {
         surface: match first.surface() {

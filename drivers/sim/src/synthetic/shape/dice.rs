@@ -59,12 +59,15 @@ impl Triangles {
     }
 
     fn add(&mut self, patch: &Patch<'_>, spacing: &dyn Fn(Vec3) -> f32, normal: &dyn Fn(Vec3) -> Vec3) {
-        let tiles = patch.size.map(|s| if patch.radius.is_finite() { 1 } else { (s / TILE_M).ceil().max(1.0) as usize });
+        let tiles = patch
+            .size
+            .map(|s| if patch.radius.is_finite() { 1 } else { (s / TILE_M).ceil().max(1.0) as usize });
         for (i, j) in (0..tiles[0]).flat_map(|i| (0..tiles[1]).map(move |j| (i, j))) {
             let [width, height] = [1.0 / tiles[0] as f32, 1.0 / tiles[1] as f32];
             let inside = |u: f32, v: f32| (patch.at)((i as f32 + u) * width, (j as f32 + v) * height);
             let apart = spacing(inside(0.5, 0.5)).min(CHORD * patch.radius);
-            let count = [0, 1].map(|k| (patch.size[k] / tiles[k] as f32 / apart).ceil().clamp(1.0, 2000.0) as u32);
+            let count =
+                [0, 1].map(|k| (patch.size[k] / tiles[k] as f32 / apart).ceil().clamp(1.0, 2000.0) as u32);
             let first = self.corners.len() as u32;
             for (b, a) in (0..=count[1]).flat_map(|b| (0..=count[0]).map(move |a| (b, a))) {
                 let [u, v] = [a as f32 / count[0] as f32, b as f32 / count[1] as f32];
