@@ -17,7 +17,7 @@ scenes() { # NAME ARGUMENT...
 scenes train --seed 301 --count 1500 --sensor stereo --without "$held_out"
 scenes held-out --seed 303 --count 150 --sensor stereo --families "$held_out"
 again=()
-for n in 1 2 3 4 5; do
+for n in 1 2 3; do
     scenes "again-$n" --seed 303 --count 150 --sensor stereo --families "$held_out" --again "$n"
     again+=("$data/again-$n")
 done

@@ -2,7 +2,7 @@
 """Renders worlds of `depthrig scenes --worlds` with a path tracer that is not ours, and says what ours lacks.
 
     depthrig scenes --seed 11 --count 8 --size 320x240 --worlds WORLDS
-    .venv-reference/bin/python tools/reference/reference.py WORLDS OUT [--spp 64]
+    .venv-reference/bin/python tools/reference/reference.py WORLDS OUT [--spp 8]
 
 True depth is checked with one ray of Mitsuba through the centre of each pixel, against meshes. Colour is path traced with
 refraction, interreflection and soft shadows, and light comes from the lamps alone: the light from all around, which our
@@ -284,7 +284,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Compare worlds with a path tracer")
     parser.add_argument("worlds", metavar="WORLDS", type=Path, help="folder of depthrig scenes --worlds")
     parser.add_argument("out", metavar="OUT", type=Path, help="folder for images and numbers")
-    parser.add_argument("--spp", type=int, default=64, help="paths of each of four parts of a pixel [default: 64]")
+    parser.add_argument("--spp", type=int, default=8, help="paths of each of four parts of a pixel [default: 8]")
     args = parser.parse_args()
     folders = sorted(p.parent for p in args.worlds.glob("*/world.json"))
     if not folders:

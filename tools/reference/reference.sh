@@ -7,7 +7,7 @@ out=target/reference
 cargo build --package depthrig
 if [ ! -e "$out/worlds" ]; then
     rm -rf "$out/worlds.part"
-    "${CARGO_TARGET_DIR:-target}/debug/depthrig" scenes --seed 11 --count 10 --size 320x240 --worlds "$out/worlds.part"
+    "${CARGO_TARGET_DIR:-target}/debug/depthrig" scenes --seed 11 --count 8 --size 320x240 --worlds "$out/worlds.part"
     mv "$out/worlds.part" "$out/worlds"
 fi
 .venv-reference/bin/python tools/reference/reference.py "$out/worlds" "$out" "$@"

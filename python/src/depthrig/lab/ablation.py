@@ -116,8 +116,9 @@ def _daemon_fill(config: Config) -> float | None:
     source = open_source(config.check[0])
     limits = (config.train.loss.near_m, config.train.loss.far_m)
     images = []
-    for i in range(len(source)):
-        sample = source[i]
+    # Those that a training is measured on.
+    for i in np.linspace(0, len(source) - 1, min(len(source), config.train.check_samples)).astype(int):
+        sample = source[int(i)]
         if sample.filled is None:
             return None
         images.append(measure(sample.filled, sample.need_truth(), *limits))
