@@ -195,13 +195,16 @@ mod tests {
                 let outward: Vec3 = triangle.iter().map(|i| made.normals[*i as usize]).sum();
                 assert!((b - a).cross(c - a).dot(outward) >= 0.0, "{:?}", solid.shape);
             }
-            // The volume by a count of points inside.
-            let r = solid.bound;
-            let n = 60;
-            let at = |i: usize| ((i as f32 + 0.5) / n as f32 * 2.0 - 1.0) * r;
+            // The volume by a count of points inside, in the box around the corners.
+            let low = made.corners.iter().copied().reduce(Vec3::min).unwrap();
+            let high = made.corners.iter().copied().reduce(Vec3::max).unwrap();
+            let n = 40;
+            let part = |i: usize| (i as f32 + 0.5) / n as f32;
             let points = (0..n).flat_map(|x| (0..n).flat_map(move |y| (0..n).map(move |z| [x, y, z])));
-            let inside = points.filter(|p| solid.distance(Vec3::from(p.map(at))) < 0.0).count();
-            let counted = inside as f32 * (2.0 * r / n as f32).powi(3);
+            let is_inside =
+                |p: &[usize; 3]| solid.distance(low + Vec3::from(p.map(part)) * (high - low)) < 0.0;
+            let share = points.filter(is_inside).count() as f32 / (n * n * n) as f32;
+            let counted = share * (high - low).element_product();
             assert!((volume / counted - 1.0).abs() < 0.1, "{:?}: {volume} {counted}", solid.shape);
         }
     }
