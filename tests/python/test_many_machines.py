@@ -564,7 +564,7 @@ def test_tiny_refines_segments_too(binary: str, data: Path, tmp_path: Path) -> N
     for more, cure in (
         (["--model", "cdm-d435"], "runs a file NAME.onnx, not the installed model cdm-d435"),
         (["--model", "gone.onnx"], "gone.onnx: cannot be read"),
-        (["--device", "cuda:0"], "cpu"),
+        (["--device", "cuda:0"], "tiny runs on the CPU"),
     ):
         ended, _, why = code(binary, *arguments, str(tmp_path / "bad"), *more)
         assert (ended, cure in why) == (2, True), why

@@ -20,9 +20,11 @@ use std::path::{Path, PathBuf};
 mod dataset;
 mod sample;
 mod tar;
+mod world;
 
 pub use dataset::SceneSets;
 pub use sample::contact_sheet;
+pub use world::write_world;
 
 /// Version of the layout.
 pub const FORMAT: u32 = 1;
@@ -203,6 +205,9 @@ struct Arguments<'a> {
     cameras: &'a [String],
     sensor: &'static str,
     hide: f32,
+    /// Absent at 0: records of runs from before it stay as they are.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    again: Option<u64>,
     families: Vec<&'static str>,
     width: u32,
     height: u32,
@@ -240,6 +245,7 @@ fn record(generator: &Generator, plan: &Plan) -> Result<()> {
                 Sensor::Stereo => "stereo",
             },
             hide: s.hide,
+            again: (s.again > 0).then_some(s.again),
             families: s.families.iter().map(|f| f.name()).collect(),
             width: s.width,
             height: s.height,

@@ -11,7 +11,7 @@ use crate::watched::usage;
 use anyhow::{Result, bail};
 use clap::ValueEnum;
 use depthrig_convert::RunPart;
-use depthrig_convert::scenes::{self, Plan, contact_sheet};
+use depthrig_convert::scenes::{self, Plan, contact_sheet, write_world};
 use depthrig_convert::store::Place;
 use depthrig_sim::synthetic::scenes::{Family, Generator, Sensor, Settings, TriangleMesh, Triplet};
 use std::path::{Path, PathBuf};
@@ -24,6 +24,9 @@ same without holes (as the refiner fill fills them), and the material of each pi
 A sample depends on the arguments, the seed and its number alone. A shard has its name once it is complete; a run that
 was interrupted goes on where it was. --shard 0/4 makes the first of four parts, on this computer or another one.
 
+--worlds DIR writes each world of the run as a folder DIR/NUMBER: meshes (PLY) with colours, camera, lamps, and what
+the camera sees.
+
 Families: box, ball, superquadric, cup, bottle, bowl, plate, cutlery, cable, cloth, and mesh with --meshes.
 Cameras: d405, d415, d435, d455, l515, zed2i, kinect, generic.
 
@@ -35,13 +38,14 @@ Examples:
   depthrig scenes --count 20000 --hide 0.5 --out train
   depthrig scenes --count 20000 --sensor stereo --shard 2/8 --out train
   depthrig scenes --count 12 --preview sheet.png
-  depthrig scenes --count 50 --camera d435 --dataset data/random";
+  depthrig scenes --count 50 --camera d435 --dataset data/random
+  depthrig scenes --count 8 --size 320x240 --worlds worlds";
 
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct ScenesArgs {
     /// Folder of the shards, or s3://BUCKET/PREFIX
-    #[arg(long, value_name = "DIR", required_unless_present_any = ["preview", "dataset"])]
+    #[arg(long, value_name = "DIR", required_unless_present_any = ["preview", "dataset", "worlds"])]
     out: Option<PathBuf>,
     /// New dataset, instead of shards: a world each set, one camera with its nominal lens, and true depth
     #[arg(long, value_name = "DIR", conflicts_with_all = ["out", "per_shard", "shard", "scratch", "name", "threads"])]
@@ -61,6 +65,9 @@ pub struct ScenesArgs {
     /// Share of the samples in which random regions of measured depth are hidden, 0 to 1
     #[arg(long, value_name = "SHARE", default_value_t = 0.0)]
     hide: f32,
+    /// Number of the measurement: another one draws sensor and noise anew, of the same worlds
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    again: u64,
     /// Width and height of the images, pixels
     #[arg(long, value_name = "WxH", default_value = "640x480", value_parser = size)]
     size: [u32; 2],
@@ -87,6 +94,9 @@ pub struct ScenesArgs {
     /// Image of the first samples: colour, true and measured depth
     #[arg(long, value_name = "FILE")]
     preview: Option<PathBuf>,
+    /// Folder for the worlds as meshes, for other renderers
+    #[arg(long, value_name = "DIR")]
+    worlds: Option<PathBuf>,
     #[command(flatten)]
     overwrite: Overwrite,
     /// Threads [default: all cores]
@@ -132,6 +142,16 @@ pub fn run(args: &ScenesArgs, context: &Context) -> Result<Exit> {
         }
         bar.clear();
         preview.write(&contact_sheet(&samples, generator.settings())?)?;
+    }
+    if let Some(folder) = &args.worlds {
+        for number in 0..args.count {
+            bar.set("writing worlds", number, args.count);
+            write_world(&generator.world(number), generator.settings(), folder)?;
+            if stop.is_asked() {
+                bail!("interrupted after {} worlds", number + 1);
+            }
+        }
+        bar.clear();
     }
     if let Some(dataset) = &args.dataset {
         return super::import::scenes(generator, args.count, dataset, args.json, context);
@@ -199,6 +219,7 @@ fn settings(args: &ScenesArgs) -> Result<Settings> {
         },
         hide: args.hide,
         nominal_lens: args.dataset.is_some(),
+        again: args.again,
         families: all.into_iter().filter(|f| !args.without.contains(f)).collect(),
         meshes,
     })

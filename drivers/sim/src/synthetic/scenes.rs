@@ -19,7 +19,7 @@ use super::noise::mix;
 use super::random::{Draw, RandomWorld, Stock};
 use super::scene::World;
 use super::shape::Mesh;
-use super::texture::{DARK_ALBEDO, Surface};
+use super::texture::{DARK_ALBEDO, Paint, Surface};
 use super::view::{NOTHING, Rays, View};
 use depthrig_bus::{Intrinsics, Pose};
 use depthrig_calib::{PoseExt, Registration, same_view};
@@ -30,8 +30,10 @@ use std::sync::Arc;
 mod hide;
 mod ir;
 mod optics;
+mod world;
 
 pub use super::random::{Family, SceneKind};
+pub use world::{WorldLamp, WorldModel, WorldPart};
 
 /// Metres per count of true depth.
 pub const TRUTH_UNIT_M: f64 = 1e-4;
@@ -76,6 +78,8 @@ pub struct Settings {
     pub hide: f32,
     /// Every sample has the lens of its camera model; else each one is a little off it.
     pub nominal_lens: bool,
+    /// Number of the measurement: each draws sensor and noise anew, of the same worlds, views and colour images.
+    pub again: u64,
     /// Families of objects.
     pub families: Vec<Family>,
     /// Meshes for [`Family::Mesh`].
@@ -92,6 +96,7 @@ impl Default for Settings {
             sensor: Sensor::Statistical,
             hide: 0.0,
             nominal_lens: false,
+            again: 0,
             families: Family::ALL.into_iter().filter(|f| *f != Family::Mesh).collect(),
             meshes: Vec::new(),
         }
@@ -188,23 +193,28 @@ impl Generator {
         &self.settings
     }
 
+    fn model(&self, number: u64) -> &'static Model {
+        self.models[(number % self.models.len() as u64) as usize]
+    }
+
     /// Sample `number`.
     ///
     /// # Errors
     /// [`ErrorKind::BadInput`] when a view cannot be registered.
     pub fn sample(&self, number: u64) -> Result<Triplet> {
         let Settings { seed, width, height, sensor, .. } = self.settings;
-        let model = self.models[(number % self.models.len() as u64) as usize];
-        let model = &varied(model, &mut Draw::new(seed, number, 5));
+        let model = self.model(number);
+        let measured = if self.settings.again == 0 { seed } else { mix(seed ^ mix(self.settings.again)) };
+        let model = &varied(model, &mut Draw::new(measured, number, 5));
         let RandomWorld { world, kind, families, camera_pose } = RandomWorld::new(seed, number, &self.stock);
-        let off = if self.settings.nominal_lens { 0.0 } else { 1.0 };
-        let optics = Optics::new(model, off, seed, number, (width, height));
-        let noise = mix(seed ^ mix(number.wrapping_add(0x5CE4E)));
+        let optics = self.optics(model, number);
+        let noise_of = |seed: u64| mix(seed ^ mix(number.wrapping_add(0x5CE4E)));
+        let noise = noise_of(measured);
 
         let rays = Rays::new(&optics.color, width, height);
         let view = View::new(&rays, &(camera_pose * model.color_in_device.to_affine()));
         let mets = view.cast(&world);
-        let mut color = color::render_met(&world, &view, &mets, model.white, noise);
+        let mut color = color::render_met(&world, &view, &mets, model.white, noise_of(seed));
         optics::blemish(&mut Draw::new(seed, number, 3), &mut color, width as usize);
         let truth = mets.iter().map(|m| if *m == NOTHING { 0 } else { depth::counts(m.t, TRUTH_UNIT_M) });
         let material = mets.iter().map(|m| material_of(&world, m.key)).collect();
@@ -249,6 +259,11 @@ impl Generator {
             scene: kind,
             intrinsics: optics.color,
         })
+    }
+
+    fn optics(&self, model: &Model, number: u64) -> Optics {
+        let Settings { seed, width, height, nominal_lens, .. } = self.settings;
+        Optics::new(model, if nominal_lens { 0.0 } else { 1.0 }, seed, number, (width, height))
     }
 }
 
@@ -334,11 +349,10 @@ fn fitted(modes: &[Mode], (width, height): (u32, u32)) -> Mode {
 }
 
 fn material_of(world: &World, key: u16) -> u8 {
-    let paint = if key == NOTHING.key {
-        return 0;
-    } else {
-        world.paint(key)
-    };
+    if key == NOTHING.key { 0 } else { material_of_paint(world.paint(key)) }
+}
+
+fn material_of_paint(paint: Paint) -> u8 {
     match paint.surface() {
         Surface::Glass => 4,
         Surface::Shiny | Surface::Mirror => 3,

@@ -36,9 +36,9 @@ class ModelConfig:
     kind: str = "tiny"
     """`tiny`, `cdm` (the official form), `hole` or `value` (noise models of a camera)."""
     encoder: str = "vits"
-    """Encoder of `cdm`, `hole` and `value`: `vits`, `vitb` or `vitl`."""
+    """Encoder of `cdm`, `hole` and `value`: `vits`, `vitb` or `vitl`. `conv`, of `hole` and `value` alone, is a U-Net."""
     width: int = 48
-    """Channels of the first stage of `tiny`."""
+    """Channels of the first stage of `tiny` and of `conv`."""
     weights: str | None = None
     """State to begin with: a file of `torch.save(net.state_dict())`. Names that it lacks stay as they are drawn."""
     refined_input: bool = False
@@ -46,7 +46,9 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         _one_of("kind", self.kind, ("tiny", "cdm", "hole", "value"))
-        _one_of("encoder", self.encoder, ("vits", "vitb", "vitl"))
+        _one_of("encoder", self.encoder, ("vits", "vitb", "vitl", "conv"))
+        if self.encoder == "conv" and self.kind == "cdm":
+            raise LabError('encoder = "conv" is one of noise models; kind = "cdm" needs vits, vitb or vitl')
         _within("width", self.width, 8, 256)
         if self.width % 8:
             raise LabError(f"width = {self.width} is not a multiple of 8")
@@ -87,6 +89,8 @@ class SynthesisConfig:
     """`make_shards`: state of the camera's value model, of `model.encoder`."""
     hole: str | None = None
     """The same of its hole model."""
+    filter: bool = True
+    """Whether value noise is filtered along the truth (the guided filter), but for a tenth of the images."""
     strength: float = 1.0
     """Factor of every high-frequency noise; 0 is none."""
 
@@ -129,7 +133,7 @@ class TrainConfig:
     batch: int = 8
     """Samples of one step in one process."""
     crop: tuple[int, int] = (192, 256)
-    """Height and width of the crop; multiples of 16 for `tiny`, of 14 for the others."""
+    """Height and width of the crop; multiples of 16 for `tiny`, any for `conv`, of 14 for the others."""
     flip: bool = False
     """Mirrored images half of the time. Refused for stereo: what is hidden lies left of things."""
     color_jitter: float = 0.2
@@ -195,7 +199,8 @@ class Config:
         if not self.data:
             raise LabError("there is no [[data]]; name at least one dataset")
         _within("seed", self.seed, 0, 2**63 - 1)
-        multiple = 16 if self.model.kind == "tiny" else 14
+        of_vit = 1 if self.model.encoder == "conv" else 14
+        multiple = 16 if self.model.kind == "tiny" else of_vit
         if any(side % multiple for side in self.train.crop):
             raise LabError(
                 f"crop = {list(self.train.crop)} are not multiples of {multiple}, as {self.model.kind} needs"
