@@ -219,9 +219,10 @@ impl<'a> SessionText<'a> {
                 Some(outcome) => drop(table.insert("outcome", toml_edit::value(outcome.name()))),
                 None => drop(table.remove("outcome")),
             }
-            match after.discarded {
-                true => drop(table.insert("discarded", toml_edit::value(true))),
-                false => drop(table.remove("discarded")),
+            if after.discarded {
+                table.insert("discarded", toml_edit::value(true));
+            } else {
+                table.remove("discarded");
             }
         }
         let before = before.map_or("", |e| e.state()).to_owned();

@@ -124,14 +124,14 @@ impl Episode {
 
     /// It in words, such as `3: success, 12.4 s, put the cup on the plate`.
     pub fn text(&self) -> String {
-        let mut text = format!("{}: {}", self.number, self.state());
+        let mut parts = vec![format!("{}: {}", self.number, self.state())];
         if let Some(end) = self.end_utc_ns {
-            text += &format!(", {:.1} s", (end - self.start_utc_ns) as f64 / 1e9);
+            parts.push(format!("{:.1} s", (end - self.start_utc_ns) as f64 / 1e9));
         }
         if !self.task.is_empty() {
-            text += &format!(", {}", self.task);
+            parts.push(self.task.clone());
         }
-        text
+        parts.join(", ")
     }
 
     fn end(&mut self, end: EpisodeEnd, utc_ns: i64) {

@@ -189,7 +189,7 @@ fn part(
         },
         material: super::material_of_paint(first),
         infrared: first.infrared().albedo,
-        triangles: made.triangles.clone(),
+        triangles: made.faces.clone(),
         ..WorldPart::default()
     };
     for (p, n) in made.corners.iter().zip(&made.normals) {

@@ -19,7 +19,7 @@ pub(crate) struct Patch<'a> {
 pub(crate) struct Triangles {
     pub(crate) corners: Vec<Vec3>,
     pub(crate) normals: Vec<Vec3>,
-    pub(crate) triangles: Vec<[u32; 3]>,
+    pub(crate) faces: Vec<[u32; 3]>,
 }
 
 /// Chords on curved surfaces are at most this part of the radius.
@@ -36,7 +36,7 @@ impl Triangles {
             for triangle in mesh.triangles() {
                 let [a, b, c] = *triangle;
                 out.normals.extend([(b - a).cross(c - a).normalize_or(Vec3::Z); 3]);
-                out.triangles.push([0, 1, 2].map(|i| out.corners.len() as u32 + i));
+                out.faces.push([0, 1, 2].map(|i| out.corners.len() as u32 + i));
                 out.corners.extend(triangle);
             }
             return out;
@@ -51,7 +51,7 @@ impl Triangles {
     pub(crate) fn of_room((low, high): (Vec3, Vec3), face: usize, spacing: &dyn Fn(Vec3) -> f32) -> Self {
         let middle = (low + high) / 2.0;
         let mut inward = Vec3::ZERO;
-        inward[face / 2] = if face % 2 == 0 { 1.0 } else { -1.0 };
+        inward[face / 2] = if face.is_multiple_of(2) { 1.0 } else { -1.0 };
         let mut out = Self::default();
         let patches = faces((high - low) / 2.0, f32::INFINITY, |p| p + middle);
         out.add(&patches[face], spacing, &|_| inward);
@@ -91,7 +91,7 @@ impl Triangles {
         let way = (q - p).cross(r - p);
         let outward = [a, b, c].map(|i| self.normals[i as usize]).iter().sum::<Vec3>();
         if way.length_squared() > 0.0 {
-            self.triangles.push(if way.dot(outward) < 0.0 { [a, c, b] } else { [a, b, c] });
+            self.faces.push(if way.dot(outward) < 0.0 { [a, c, b] } else { [a, b, c] });
         }
     }
 }
@@ -182,7 +182,7 @@ mod tests {
             let solid = Solid::new(shape, Vec3::ZERO, Mat3::IDENTITY);
             let made = Triangles::of(&solid, &|_| 0.01);
             let mut volume = 0.0;
-            for triangle in &made.triangles {
+            for triangle in &made.faces {
                 let [a, b, c] = triangle.map(|i| made.corners[i as usize]);
                 volume += a.dot(b.cross(c)) / 6.0;
                 for i in triangle {
@@ -219,7 +219,7 @@ mod tests {
             for (p, n) in made.corners.iter().zip(&made.normals) {
                 assert!((*p - wall)[face / 2].abs() < 1e-5 && n.dot(middle - *p) > 0.0, "{face}: {p} {n}");
             }
-            for t in &made.triangles {
+            for t in &made.faces {
                 let [a, b, c] = t.map(|i| made.corners[i as usize]);
                 assert!((b - a).cross(c - a).dot(middle - a) > 0.0, "{face}");
             }
