@@ -26,7 +26,7 @@ fn a_sample_depends_on_seed_and_number_alone() {
 fn another_measurement_is_of_the_same_world_and_not_the_same() {
     for sensor in [Sensor::Statistical, Sensor::Stereo] {
         let made = |again| {
-            Generator::new(Settings { again, sensor, ..settings(&["d435"]) }).unwrap().sample(4).unwrap()
+            Generator::new(Settings { sensor, again, ..settings(&["d435"]) }).unwrap().sample(4).unwrap()
         };
         let [first, second, third] = [made(0), made(1), made(2)];
         assert_eq!((&first.color, &first.truth), (&second.color, &second.truth), "{sensor:?}");
