@@ -198,7 +198,7 @@ def test_weights_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     torch.save({"model": {f"module.{k}": v for k, v in state.items()}}, path)
     assert load_weights(Tiny(16), path) == []
     assert build(ModelConfig(width=16, weights=str(path))).apart.weight.equal(state["apart.weight"])
-    with pytest.raises(LabError, match=r"w\.pt: tensor apart\.weight is \[16, 6, 2, 2\], \[32"):
+    with pytest.raises(LabError, match=r"w\.pt: tensor apart\.weight is \[16, 7, 8, 8\], \[32"):
         load_weights(Tiny(32), path)
     with pytest.raises(LabError, match="not of this network"):
         load_weights(NoiseNet(SMALL), path)
