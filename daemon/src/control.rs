@@ -375,7 +375,7 @@ pub enum EpisodeRequest {
     },
     /// The one that runs ends and is kept.
     Stop {
-        /// Whether the task was done.
+        /// Judgement of the task.
         #[serde(default)]
         outcome: Option<EpisodeOutcome>,
     },
@@ -387,7 +387,7 @@ pub enum EpisodeRequest {
     },
     /// One that has ended is judged, and kept.
     Mark {
-        /// Whether the task was done; without it no judgement.
+        /// Judgement of the task; `None` takes it back.
         #[serde(default)]
         outcome: Option<EpisodeOutcome>,
         /// Which; without it the last one.

@@ -335,6 +335,10 @@ impl Recording {
     /// # Errors
     /// `WrongState` when no recording is going on.
     pub fn take(&mut self) -> Result<Finishing> {
+        if let Some(active) = &self.active {
+            // None is running, mostly. The status has it as it will be in the dataset.
+            let _ = active.recorder.end_episode(EpisodeEnd::Kept(None));
+        }
         self.refresh();
         let mut active = self.active.take().ok_or_else(none_active)?;
         self.motion.end(&mut active.motion);

@@ -159,16 +159,19 @@ def test_a_python_program_steers_its_recording_and_episodes(
         text = (ROOT / "docs" / "demonstrations.md").read_text().partition("\n## Episodes\n")[2]
         (code,) = [block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "Recording()" in block]
         code = code.replace("Recording()", "Recording(runtime_dir=folder)")
-        recording.stop()
+        assert recording.start_episode("to the end").number == 3
+        stopped = recording.stop()
+        assert (stopped["episodes"], stopped["episode"]["number"]) == (2, 3)
+        assert "end_utc_ns" in stopped["episode"]
         exec(code, {"depthrig": depthrig, "time": time, "folder": runtime})
         judged = recording.status()
         assert judged is not None
         assert (judged["active"], judged["episodes"], judged["episode"]["outcome"]) == (False, 1, "success")
         ended = json.loads(command(binary, runtime, "info", str(started["path"]), "--json", codes=(0, 3)))
-        assert [e["number"] for e in ended["episodes"]] == [1, 2]
+        assert [e["number"] for e in ended["episodes"]] == [1, 2, 3]
     gone = recording
     with pytest.raises(depthrig.RigNotRunning):
         gone.status()
     info = json.loads(command(binary, runtime, "info", str(started["path"]), "--json", codes=(0, 3)))
     states = [(e.get("outcome"), e.get("discarded", False)) for e in info["episodes"]]
-    assert states == [("success", False), (None, True)]
+    assert states == [("success", False), (None, True), (None, False)]

@@ -41,7 +41,8 @@ impl SceneSets {
             return Err(bad("a stream of a dataset has one lens; use the nominal one".to_owned()));
         }
         let first = super::sample_of(&generator, 0)?;
-        let (width, height) = (settings.width, settings.height);
+        let width = settings.width;
+        let height = settings.height;
         let stream = |name: &str, format: PixelFormat, depth_unit_m: f64| {
             let id: Result<StreamId, _> = format!("{camera}/{name}").parse();
             Ok(StreamRecord {
