@@ -109,8 +109,8 @@ __all__ = [
     "StreamNotFound",
     "Timeout",
     "VersionMismatch",
-    "running_rigs",
     "recorded_signal",
+    "running_rigs",
     "signals",
     "streams",
 ]
