@@ -20,11 +20,13 @@ FEED := .venv-feed
 OAK := .venv-oak
 # Robots' meshes and a ray tracer, for the alignment of cameras with a robot's arm.
 ROBOTS := .venv-robots
+# A path tracer, for reference images of random worlds. No test needs it.
+REFERENCE := .venv-reference
 # mdBook, which makes the site of the documents.
 DOCS := .venv-docs
-REQUIREMENTS := python/requirements-test.txt $(READERS)/requirements.txt tests/page_browser/requirements.txt tests/terminal/requirements.txt
+REQUIREMENTS := python/requirements-test.txt tests/python/requirements-s3.txt $(READERS)/requirements.txt tests/page_browser/requirements.txt tests/terminal/requirements.txt
 
-.PHONY: help demo demo-calibration lab-demo train-tiny environments test check-debian13 test-long vm fuzz lint docs dist test-dist bench bench-page bench-peers bench-feed clean setup-build setup-test setup-vm setup-peers setup-fuzz setup-dist
+.PHONY: help demo demo-calibration lab-demo train-tiny noise-models reference environments test check-debian13 test-long vm fuzz lint docs dist test-dist bench bench-page bench-peers bench-feed clean setup-build setup-test setup-vm setup-peers setup-fuzz setup-dist
 
 help: ## show this list
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -76,6 +78,12 @@ lab-demo: setup-build $(LEROBOT)/.stamp ## the depth lab in a quarter of an hour
 train-tiny: setup-build $(LEROBOT)/.stamp ## the refiner `tiny`: makes its data, trains, measures, writes cdm_plugin/models/tiny.{onnx,toml}
 	tools/train-tiny.sh
 
+noise-models: setup-build $(LEROBOT)/.stamp ## the noise models of a simulated D435, how good they are, and which raw depth trains best
+	tools/noise-models.sh
+
+reference: setup-build $(REFERENCE)/.stamp ## random worlds by our caster beside a path tracer: depth, colour; into target/reference
+	tools/reference/reference.sh $(ARGS)
+
 docs: setup-build $(DOCS)/.stamp ## the site of the documents and the generated reference, in target/book
 	cargo build --workspace --bins --quiet
 	tools/docs/build.py site
@@ -110,7 +118,7 @@ bench-feed: setup-build $(FEED)/.stamp ## latency to a NumPy array in another pr
 
 clean: ## remove build outputs
 	cargo clean
-	rm -rf $(VENV) $(LEROBOT) $(PEERS_VENV) $(FEED) $(OAK) $(ROBOTS) $(DOCS) $(READERS)/node_modules
+	rm -rf $(VENV) $(LEROBOT) $(PEERS_VENV) $(FEED) $(OAK) $(ROBOTS) $(REFERENCE) $(DOCS) $(READERS)/node_modules
 
 setup-build:
 	@tools/setup.sh build
@@ -158,6 +166,10 @@ $(OAK)/.stamp: python/requirements-oak.txt
 $(ROBOTS)/.stamp: tests/python/requirements-robots.txt tests/python/robots_only.py
 	tools/environment.sh $(ROBOTS) python3 --no-deps --no-cache-dir --requirement $<
 	$(ROBOTS)/bin/python tests/python/robots_only.py
+	touch $@
+
+$(REFERENCE)/.stamp: tools/reference/requirements.txt
+	tools/environment.sh $(REFERENCE) python3 --no-cache-dir --requirement $<
 	touch $@
 
 $(DOCS)/.stamp: tools/docs/requirements.txt

@@ -2,16 +2,25 @@
 # The depth lab from nothing to a policy's feed, on two cores and without a data set: makes random scenes, trains a very small
 # network on them for some minutes, evaluates it beside `fill` and the one that ships, serves it live on a simulated
 # camera and evaluates what was recorded. Ends with two HTML reports.
-# usage: tools/lab-demo.sh [NEW FOLDER FOR EVERYTHING]
+# usage: tools/lab-demo.sh [--small] [NEW FOLDER FOR EVERYTHING]
+# --small: too few scenes and steps to learn anything; a trial of the steps. DEPTHRIG_BIN names a program that is built already.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+train=700 held_out=60 steps=700
+if [ "${1:-}" = --small ]; then
+    train=16 held_out=4 steps=4
+    shift
+fi
 out=${1:-demo-data/lab_$(date --utc +%Y%m%d_%H%M%S)}
 if [ -e "$out" ]; then
     echo "$out exists; name a new folder" >&2
     exit 2
 fi
-cargo build --release --package depthrig
-depthrig=${CARGO_TARGET_DIR:-$PWD/target}/release/depthrig
+depthrig=${DEPTHRIG_BIN:-}
+if [ -z "$depthrig" ]; then
+    cargo build --release --package depthrig
+    depthrig=${CARGO_TARGET_DIR:-$PWD/target}/release/depthrig
+fi
 root=$PWD
 mkdir -p "$out"
 cd "$out"
@@ -31,11 +40,11 @@ trap stop EXIT
 
 step "random tables and rooms: colour, true depth, and what a D435 measures of them"
 scenes=("$depthrig" scenes --camera d435 --size 320x240 --hide 0.5)
-"${scenes[@]}" --seed 1 --count 700 --without bottle,cutlery --out train --preview scenes.png
-"${scenes[@]}" --seed 2 --count 60 --families bottle,cutlery --out held-out
+"${scenes[@]}" --seed 1 --count "$train" --without bottle,cutlery --out train --preview scenes.png
+"${scenes[@]}" --seed 2 --count "$held_out" --families bottle,cutlery --out held-out
 
 step "training"
-cat >train.toml <<'TOML'
+cat >train.toml <<TOML
 name = "lab-demo"
 folder = "run"
 ships = true
@@ -54,14 +63,14 @@ kind = "tiny"
 width = 16
 
 [train]
-steps = 700
+steps = $steps
 batch = 8
 crop = [160, 208]
 ema = 0.99
-loss.missing = 2.0
+loss.space = "fill"
 check_samples = 16
 TOML
-"$root/tools/python.sh" run-lab torch.distributed.run --nproc-per-node 2 -m depthrig.lab.train "$out/train.toml"
+"$root/tools/python.sh" run-lab torch.distributed.run --standalone --nproc-per-node 2 -m depthrig.lab.train "$out/train.toml"
 
 step "evaluation on families of objects that training never saw"
 "$depthrig" eval held-out --refine fill --refine tiny --refine lab-demo=run/tiny.onnx --out held-out.html
@@ -76,6 +85,21 @@ name = "d435"
 backend = "synthetic"
 model = "d435"
 truth = true
+
+[[camera.stream]]
+name = "color"
+width = 640
+height = 480
+
+[[camera.stream]]
+name = "depth"
+width = 640
+height = 480
+
+[[camera.stream]]
+name = "depth_true_color"
+width = 640
+height = 480
 
 [camera.refine]
 engine = "tiny"

@@ -20,6 +20,6 @@ scenes full --seed 102 --count 700 --size 640x480 --hide 0.6 --without "$held_ou
 scenes stereo --seed 103 --count 300 --size 640x480 --hide 0.4 --without "$held_out" --camera d435,d405,zed2i --sensor stereo
 scenes held-out --seed 901 --count 160 --size 640x480 --hide 0.5 --families "$held_out" --camera d435,d405,l515,zed2i
 
-tools/python.sh run-lab depthrig.lab.train "$config"
+tools/python.sh run-lab torch.distributed.run --standalone --nproc-per-node 2 -m depthrig.lab.train "$config"
 tools/python.sh run-lab depthrig.lab.ship "$config" --real "${DEPTHRIG_TEST_DATA:-../shared/data}" --depthrig "$program" \
     --out cdm_plugin/models

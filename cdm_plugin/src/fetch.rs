@@ -18,6 +18,8 @@ use std::path::{Path, PathBuf};
 
 mod http;
 
+pub use http::agent;
+
 use http::{Answer, Client};
 
 /// Where the published models are.

@@ -3,7 +3,7 @@
 //! The steps, on inverse depth (1/m):
 //! 1. [`FillRefiner`] fills every hole, and knows which of them lie beyond the reach;
 //! 2. colour, filled and raw depth become the planes of the network's input ([`planes`]), padded to multiples of 16;
-//! 3. the network multiplies the filled depth, within a factor of e²;
+//! 3. the network multiplies the filled depth in holes, within a factor of e²; what was measured and kept stays;
 //! 4. the padding goes, and where `fill` with its reach knows nothing, nothing is known.
 //!
 //! An image without any depth stays without, and the network does not run for it.

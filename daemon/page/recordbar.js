@@ -19,6 +19,7 @@ const COUNTDOWN_KEY = "depthrig-countdown";
 const LOSS_SOUND_MS = 2000;
 /** An older status may come so long after an answer; a clock that is set back must not stop the bar for longer. */
 const ANSWER_MS = 3000;
+const NO_CONNECTION = "Not done: this page has no connection to the daemon.";
 
 /** @type {Record<RecordState, string>} */
 const STATE_TEXT = { idle: "Idle", recording: "Recording", closing: "Closing" };
@@ -99,7 +100,16 @@ export class RecordBar {
 
   /** Starts a recording, after the countdown if one is chosen; stops the countdown, or the one that goes on. */
   toggle() {
-    if (this.cancelCountdown() || !this.#isReady) {
+    if (this.cancelCountdown()) {
+      return;
+    }
+    if (!this.#isLive) {
+      // Who presses a pedal looks at the robot.
+      setText(this.#error, NO_CONNECTION);
+      play("error");
+      return;
+    }
+    if (!this.#isReady) {
       return;
     }
     if (this.#shown === "recording") {
@@ -167,6 +177,8 @@ export class RecordBar {
     this.#bar.classList.toggle("is-old", !isLive);
     if (!isLive) {
       this.cancelCountdown();
+    } else if (this.#error.textContent === NO_CONNECTION) {
+      setText(this.#error, "");
     }
     this.#enable();
   }

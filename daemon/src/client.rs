@@ -7,11 +7,12 @@ mod http;
 mod tests;
 
 use crate::api::{self, LoopRequest, NoteRequest, PageAddress, RateRequest, StepRequest};
-use crate::control::{RecordRequest, SeekRequest};
+use crate::control::{EpisodeRequest, RecordRequest, SeekRequest};
 use crate::status::{RecordingStatus, ReplayStatus, RigStatus};
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::{RigName, RuntimeDir};
+use depthrig_recorder::Episode;
 use http::{Answer, Connector, Failure};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -129,6 +130,14 @@ impl Client {
     pub fn record_note(&self, text: &str) -> Result<()> {
         let body = self.encode(&NoteRequest { text: text.to_owned() })?;
         self.send("POST", "/v1/record/note", Some(body), TIMEOUT).map(drop)
+    }
+
+    /// Begins, ends or judges an episode.
+    ///
+    /// # Errors
+    /// As [`Self::status`] and [`crate::control::Control::episode`].
+    pub fn episode(&self, request: &EpisodeRequest) -> Result<Episode> {
+        self.post("/v1/episode", request, TIMEOUT)
     }
 
     /// How far the replay has come.

@@ -8,7 +8,7 @@ use depthrig_bus::{RigName, RuntimeDir, UtcPair};
 use depthrig_calibrate::file::CalibratedCamera;
 use depthrig_calibrate::mount::UncertaintyMap;
 use depthrig_driver::controls::ControlValue;
-use depthrig_recorder::{Mark, RecorderOptions, Session};
+use depthrig_recorder::{Episode, EpisodeOutcome, Mark, RecorderOptions, Session};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -104,6 +104,13 @@ pub trait Control: Send + Sync {
     /// # Errors
     /// `WrongState` when none is going on, `BadInput` for an empty note.
     fn record_note(&self, text: &str) -> Result<()>;
+
+    /// Begins, ends or judges an episode of the recording.
+    ///
+    /// # Errors
+    /// `WrongState` when no recording is going on or no episode is running, `InUse` when one is, `NotFound` for an unknown one, `BadInput` for a
+    /// task that is too long.
+    fn episode(&self, request: &EpisodeRequest) -> Result<Episode>;
 
     /// When the recording in progress, or the last one, lost something; `None` before the first.
     fn record_losses(&self) -> Option<RecordingLosses> {
@@ -354,6 +361,39 @@ pub struct SeekRequest {
 pub struct StopRequest {
     /// A judgement of it.
     pub mark: Option<Mark>,
+}
+
+/// Change of an episode, a demonstration within a recording.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "action", rename_all = "snake_case", deny_unknown_fields)]
+pub enum EpisodeRequest {
+    /// One begins.
+    Start {
+        /// The task.
+        #[serde(default)]
+        task: String,
+    },
+    /// The one that runs ends and is kept.
+    Stop {
+        /// Whether the task was done.
+        #[serde(default)]
+        outcome: Option<EpisodeOutcome>,
+    },
+    /// One is not to be used.
+    Discard {
+        /// Which; without it the one that runs, which ends, else the last one.
+        #[serde(default)]
+        number: Option<u32>,
+    },
+    /// One that has ended is judged, and kept.
+    Mark {
+        /// Whether the task was done; without it no judgement.
+        #[serde(default)]
+        outcome: Option<EpisodeOutcome>,
+        /// Which; without it the last one.
+        #[serde(default)]
+        number: Option<u32>,
+    },
 }
 
 /// Options of a recording.

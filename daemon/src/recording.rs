@@ -1,7 +1,7 @@
 //! Recording under control of the daemon: start, stop, notes, and the numbers that go with it.
 
 use crate::config::{RecordingConfig, RigConfig};
-use crate::control::{LiveRig, RecordRequest};
+use crate::control::{EpisodeRequest, LiveRig, RecordRequest};
 use crate::losses::{LossHistory, Losses, RecordingLosses};
 use crate::status::{RecordingStatus, SetAccount};
 use crate::stream::Stream;
@@ -9,8 +9,8 @@ use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::{DropCounts, Frame, HostTime, SignalSample, StreamId, UtcPair};
 use depthrig_recorder::{
-    Diagnostic, Pixels, RecordFrame, RecordSet, Recorder, RecorderOptions, Session, SignalRecord,
-    StreamAccount, Summary, UtcSource, fs,
+    Diagnostic, Episode, EpisodeEnd, Pixels, RecordFrame, RecordSet, Recorder, RecorderOptions, Session,
+    SignalRecord, StreamAccount, Summary, UtcSource, fs,
 };
 use place::place;
 pub use recovery::recover_left;
@@ -334,6 +334,32 @@ impl Recording {
         active.recorder.add_note(text).map_err(Error::from)
     }
 
+    /// Begins, ends or judges an episode.
+    ///
+    /// # Errors
+    /// `WrongState` when no recording is going on, and when an episode is begun twice or ended without one, `NotFound` for an unknown
+    /// one, `BadInput` for a task that is too long.
+    pub fn episode(&mut self, request: &EpisodeRequest) -> Result<Episode> {
+        let recorder = &self.active.as_ref().ok_or_else(none_active)?.recorder;
+        let is_running = recorder.progress().episodes.last.is_some_and(|e| e.is_open());
+        let done = match request {
+            EpisodeRequest::Start { task } => recorder.start_episode(task.trim()),
+            EpisodeRequest::Stop { .. } if !is_running => {
+                return Err(Error::new(
+                    ErrorKind::WrongState,
+                    "no episode is running; start one with: depthrig episode start",
+                ));
+            }
+            EpisodeRequest::Stop { outcome } => recorder.end_episode(EpisodeEnd::Kept(*outcome)),
+            EpisodeRequest::Discard { number } => recorder.judge_episode(*number, EpisodeEnd::Discarded),
+            EpisodeRequest::Mark { outcome, number } => {
+                recorder.judge_episode(*number, EpisodeEnd::Kept(*outcome))
+            }
+        };
+        self.refresh();
+        done.map_err(Error::from)
+    }
+
     /// Takes the recorder out, to be finished without keeping others waiting.
     ///
     /// # Errors
@@ -432,6 +458,9 @@ impl Active {
         let missing = self.streams.iter().filter(|r| r.missing > 0);
         status.missing = missing.map(|r| (r.stream.id.to_string(), r.missing)).collect();
         status.frames_dropped = dropped.nonzero().map(|(r, n)| (r.name().to_owned(), n)).collect();
+        status.episodes = progress.episodes.kept;
+        status.episodes_discarded = progress.episodes.discarded;
+        status.episode = progress.episodes.last;
         status.frames = progress.frames;
         status.bytes = progress.bytes;
         status.encode_queue = progress.encode_queue as u64;

@@ -1,5 +1,6 @@
 //! Status of the daemon: the one structure behind `status`, `top`, `/v1/status` and `/metrics`.
 
+use depthrig_recorder::Episode;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -449,6 +450,15 @@ pub struct RecordingStatus {
     pub disk_free_bytes: u64,
     /// Seconds left at the present rate; `None` before a rate is known.
     pub disk_seconds_left: Option<f64>,
+    /// Episodes that are kept, without one that runs.
+    #[serde(default)]
+    pub episodes: u32,
+    /// Episodes that were discarded.
+    #[serde(default)]
+    pub episodes_discarded: u32,
+    /// The episode that runs, or the last one.
+    #[serde(default)]
+    pub episode: Option<Episode>,
     /// A warning that needs attention: little room left, a disk that does not answer.
     #[serde(default)]
     pub warning: Option<String>,

@@ -139,6 +139,15 @@ fn the_document_describes_every_call_and_no_other() {
 
 /// Every route, in every situation that it has an answer for: the answer's status and media type are described,
 /// and its body fits the schema, which has every field and no other.
+/// Bodies for an episode, and the status of the answer.
+const EPISODES: [(&str, u16); 5] = [
+    (r#"{"action": "start", "task": "cup"}"#, 200),
+    (r#"{"action": "stop"}"#, 409),
+    (r#"{"action": "go"}"#, 400),
+    (r#"{"action": "start", "outcome": "success"}"#, 400),
+    ("{}", 400),
+];
+
 #[test]
 fn every_answer_of_a_live_server_fits_the_document() {
     let served = served();
@@ -163,6 +172,9 @@ fn every_answer_of_a_live_server_fits_the_document() {
     check("GET", "/v1/record/losses", &served.get("/v1/record/losses"), 200);
     check("POST", "/v1/record/note", &served.post("/v1/record/note", r#"{"text": "lamp on"}"#), 204);
     check("POST", "/v1/record/note", &served.post("/v1/record/note", r#"{"text": ""}"#), 400);
+    for (body, status) in EPISODES {
+        check("POST", "/v1/episode", &served.post("/v1/episode", body), status);
+    }
     check("POST", "/v1/record/stop", &served.post("/v1/record/stop", ""), 200);
     check("GET", "/v1/calibration", &served.get("/v1/calibration"), 200);
     check("GET", "/v1/health", &served.get("/v1/health"), 503);

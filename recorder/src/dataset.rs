@@ -95,6 +95,13 @@ impl Dataset {
         Self { filter: Some(filter), ..self }
     }
 
+    /// The same dataset with only the segment of this index in [`Dataset::segments`]; `None` when it has none of that index.
+    #[must_use]
+    pub fn segment(&self, index: usize) -> Option<Self> {
+        let segments = vec![self.segments.get(index)?.clone()];
+        Some(Self { segments, ..self.clone() })
+    }
+
     /// The filter through which its pixels are read.
     pub const fn filter(&self) -> Option<&PixelFilter> {
         self.filter.as_ref()
@@ -149,8 +156,8 @@ impl Dataset {
     }
 }
 
-/// The number of a segment by its name; `None` when it is the name of something else.
-pub(crate) fn segment_number(name: &str) -> Option<u32> {
+/// The number of a segment by the name of its file; `None` when it is the name of something else.
+pub fn segment_number(name: &str) -> Option<u32> {
     let digits = name.strip_suffix(".part").unwrap_or(name).strip_suffix(".mcap")?.strip_prefix("seg_")?;
     let plain = digits.len() >= 4 && digits.bytes().all(|b| b.is_ascii_digit());
     plain.then(|| digits.parse().ok()).flatten()

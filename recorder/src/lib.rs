@@ -60,7 +60,7 @@ pub use compare::{
 };
 pub use dataset::{
     AttachedCalibration, Dataset, DatasetFrame, DatasetInfo, DatasetSet, MotionInfo, PixelFilter, PixelMode,
-    SetRange, SetReader, Sets, SignalInfo, SpreadStats, StreamInfo, jpeg_pixels,
+    SetRange, SetReader, Sets, SignalInfo, SpreadStats, StreamInfo, jpeg_pixels, segment_number,
 };
 pub use error::{Error, ErrorKind, Result};
 pub use frame::{
@@ -79,9 +79,9 @@ pub use recover::{
 };
 pub use select::{Edge, Moment, SetSpan};
 pub use session::{
-    Computed, Derived, Edit, FORMAT, Mark, MotionRecord, NOTE_MAX_BYTES, Note, Outcome, SESSION_FILE,
-    Session, SessionChanges, SignalRecord, StreamCalibration, StreamRecord, UnitCalibration, check_name,
-    edit, rename,
+    Computed, Derived, Edit, Episode, EpisodeCounts, EpisodeEnd, EpisodeOutcome, FORMAT, Mark, MotionRecord,
+    NOTE_MAX_BYTES, Note, Outcome, SESSION_FILE, Session, SessionChanges, SignalRecord, StreamCalibration,
+    StreamRecord, UnitCalibration, check_name, edit, rename,
 };
 pub use slice::{SliceOptions, SliceProgress, SliceReport, merge, trim};
 pub use still::{StillFormat, still};

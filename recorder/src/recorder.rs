@@ -10,7 +10,7 @@ use crate::container::pool::Pool;
 use crate::frame::{PushError, RecordSet, SetDrop};
 use crate::fs::{self, Fs};
 use crate::msgs::{Diagnostic, SetCounts, StreamAccount};
-use crate::{Error, ErrorKind, RecorderOptions, Result, Session};
+use crate::{Episode, EpisodeCounts, EpisodeEnd, Error, ErrorKind, RecorderOptions, Result, Session};
 use crossbeam::channel::{Sender, bounded};
 use depthrig_bus::sync::lock;
 use depthrig_bus::{HostTime, UtcPair};
@@ -407,6 +407,49 @@ impl Recorder {
         Ok(())
     }
 
+    /// Begins an episode now; [`Self::finish`] ends one that runs.
+    ///
+    /// # Errors
+    /// [`ErrorKind::InUse`] when one is running, [`ErrorKind::BadInput`] for a task that is too long and for too many episodes.
+    pub fn start_episode(&self, task: &str) -> Result<Episode> {
+        self.change_episode(|session, now| session.start_episode(task, now))
+    }
+
+    /// Ends the episode that runs.
+    ///
+    /// # Errors
+    /// [`ErrorKind::BadInput`] when none is running.
+    pub fn end_episode(&self, end: EpisodeEnd) -> Result<Episode> {
+        self.change_episode(|session, now| session.end_episode(end, now))
+    }
+
+    /// Judges an episode, by default the last one that has ended. One that runs can only be discarded, which ends it; without a
+    /// number it is the one that is discarded.
+    ///
+    /// # Errors
+    /// [`ErrorKind::NotFound`] when it is unknown, [`ErrorKind::InUse`] when it runs.
+    pub fn judge_episode(&self, number: Option<u32>, end: EpisodeEnd) -> Result<Episode> {
+        self.change_episode(|session, now| match session.running().map(|e| e.number) {
+            Some(n) if end == EpisodeEnd::Discarded && number.is_none_or(|number| number == n) => {
+                session.end_episode(end, now)
+            }
+            Some(n) if number == Some(n) => {
+                Err(Error::new(ErrorKind::InUse, format!("episode {n} is running; stop it first")))
+            }
+            _ => session.judge_episode(number, end),
+        })
+    }
+
+    /// Changes an episode; the change is in `session.toml` within the second.
+    fn change_episode(&self, change: impl FnOnce(&mut Session, i64) -> Result<Episode>) -> Result<Episode> {
+        let mut state = self.shared.lock();
+        // On the time axis of the sets, which a step of the wall clock does not move.
+        let now = state.anchor.map_or_else(|| (self.shared.utc)().utc_ns, |a| a.utc_ns(HostTime::now()));
+        let changed = change(&mut state.session, now)?;
+        state.session_changed = true;
+        Ok(changed)
+    }
+
     /// Puts a table of facts into `session.toml`, in place of one of this name: what is known only at the end. It is
     /// written with the outcome.
     pub fn state(&self, name: &str, table: toml::Table) {
@@ -448,6 +491,7 @@ impl Recorder {
             backlog_bytes: self.shared.load.backlog_bytes.load(Ordering::Relaxed),
             duration_ns: s.duration_ns(),
             disk: s.disk.clone(),
+            episodes: EpisodeCounts::of(&s.session.episodes),
             error: s.error.clone(),
         }
     }
@@ -458,6 +502,8 @@ impl Recorder {
     /// # Errors
     /// [`ErrorKind::Io`] when the writer thread died, which is a defect of the recorder.
     pub fn finish(mut self) -> Result<Summary> {
+        // None is running, mostly.
+        let _ = self.end_episode(EpisodeEnd::Kept(None));
         self.shared.close();
         for thread in self.threads.drain(..) {
             let _ = thread.join();

@@ -71,6 +71,9 @@ pub struct Report {
     pub started_utc_ns: i64,
     /// Notes of the operator.
     pub notes: Vec<Note>,
+    /// Demonstrations within it.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub episodes: Vec<crate::Episode>,
     /// Changes after the recording.
     pub history: Vec<Edit>,
     /// Streams that no camera gave, with what computed them.

@@ -8,11 +8,13 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 mod edit;
+mod episode;
 mod limits;
 mod signal;
 
 pub(crate) use edit::SessionText;
 pub use edit::{SessionChanges, StreamCalibration, UnitCalibration, check_name, edit, rename};
+pub use episode::{Episode, EpisodeCounts, EpisodeEnd, EpisodeOutcome};
 pub use signal::SignalRecord;
 
 /// The value of `Session::format` that this version writes and reads.
@@ -72,6 +74,9 @@ pub struct Session {
     /// Notes of the operator.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub notes: Vec<Note>,
+    /// Demonstrations, in the order of their times.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub episodes: Vec<Episode>,
     /// Firmware of each camera that says it.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub firmware: BTreeMap<String, String>,
@@ -355,6 +360,7 @@ impl Session {
             mark: None,
             outcome: None,
             notes: Vec::new(),
+            episodes: Vec::new(),
             firmware: BTreeMap::new(),
             history: Vec::new(),
             derived: Vec::new(),

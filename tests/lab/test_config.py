@@ -58,6 +58,10 @@ def test_a_configuration_is_read_and_defaults_fill_it() -> None:
         (("loss.gradient = 1", "loss.gradiant = 1"), ["line 14", "train.loss.gradiant"]),
         (('path = "/b"', ""), ["data.1.path is missing", "line 6"]),
         (("crop = [64, 96]", "crop = [64, 96]\nflip = true"), ["stereo"]),
+        (
+            ('kind = "tiny"\n[train]\ncrop = [64, 96]', 'kind = "cdm"\n[train]\nloss.space = "fill"\ncrop = [56, 98]'),
+            ["loss.space", "tiny alone"],
+        ),
         (("[model]", "[model"), ["line 10"]),
         (("[model]", "[modle]"), ["line 10", "modle"]),
     ],

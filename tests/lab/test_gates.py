@@ -53,6 +53,14 @@ def worse_net(seed: int = 0) -> Tiny:
     return net.eval()
 
 
+def identity() -> Tiny:
+    """A network that goes no part of the way to any guess."""
+    net = Tiny(8)
+    assert net.together.bias is not None
+    torch.nn.init.constant_(net.together.bias[:-1], -30.0)
+    return net.eval()
+
+
 def test_filled_depth_of_a_shard_is_used(tmp_path: Path) -> None:
     read = Shard(shards(tmp_path / "a", 2) / "t-000000.tar")[1]
     made = with_filled(1)
@@ -193,14 +201,14 @@ def test_real_regions_compare_what_was_hidden_with_what_was_measured(tmp_path: P
     of = gates.pairs(real_images(tmp_path / "real"))
     assert [p.name for p in of] == ["lingbot_depth/0", "lingbot_depth/1"]
     # The identity: what the daemon filled comes out.
-    found = gates.real(Tiny(8).eval(), of, fake_program(tmp_path), draws=2)
+    found = gates.real(identity(), of, fake_program(tmp_path), draws=2)
     assert len(found) == 2 * len(holes.KINDS) * 2
     for hidden in found:
         assert hidden.row.pixels >= 100
         assert hidden.row.fill_m == pytest.approx(hidden.row.tiny_m, rel=1e-5)
         # Depth lies between 0.5 and 1.5 m, and holes were filled with 1 m.
         assert 0 < hidden.row.fill_m / hidden.row.pixels <= 0.51
-    again = gates.real(Tiny(8).eval(), of[1:], fake_program(tmp_path), draws=2)
+    again = gates.real(identity(), of[1:], fake_program(tmp_path), draws=2)
     assert again == found[len(again) :]
     with pytest.raises(LabError, match="no real images"):
         gates.pairs(tmp_path)
@@ -208,7 +216,7 @@ def test_real_regions_compare_what_was_hidden_with_what_was_measured(tmp_path: P
     broken.write_text("#!/bin/sh\necho no >&2\nexit 1\n")
     broken.chmod(0o755)
     with pytest.raises(LabError, match="cdm run failed: no"):
-        gates.real(Tiny(8).eval(), of, broken, draws=1)
+        gates.real(identity(), of, broken, draws=1)
 
 
 def test_the_recipe_writes_both_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -224,7 +232,7 @@ def test_the_recipe_writes_both_files(tmp_path: Path, monkeypatch: pytest.Monkey
         'name = "tiny"\nfolder = "run"\nships = true\nseed = 4\n'
         '[[data]]\nkind = "shards"\npath = "train"\n[[check]]\nkind = "shards"\npath = "held-out"\n'
         '[model]\nwidth = 8\n[train]\nsteps = 5\nbatch = 2\ncrop = [32, 48]\nbf16 = true\nema = 0.5\n'
-        'loss.space = "log"\nloss.missing = 2.0\n'
+        'loss.space = "fill"\nloss.worse = 2.0\n'
     )
     real = real_images(tmp_path / "real")
     command = [str(path), "--real", str(real), "--depthrig", str(fake_program(tmp_path))]

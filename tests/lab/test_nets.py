@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 import os
 import shutil
 import subprocess
@@ -18,6 +19,7 @@ from depthrig.lab import LabError
 from depthrig.lab.config import ModelConfig
 from depthrig.lab.nets import Cdm, NoiseNet, Tiny, build, load_weights
 from depthrig.lab.nets.export import export_tiny
+from depthrig.lab.nets.planes import GUESSES, RIDGE, planes
 from depthrig.lab.nets.tiny import tiny_inputs
 from depthrig.lab.nets.vit import SIZES, Size
 
@@ -100,27 +102,84 @@ def shaken(net: Any) -> Any:
     return net
 
 
-def test_tiny_begins_as_the_identity_and_multiplies() -> None:
+def test_tiny_multiplies_in_holes_and_keeps_what_was_measured() -> None:
     net = Tiny()
     count = sum(p.numel() for p in net.parameters())
-    assert 500_000 <= count <= 1_000_000
+    assert 400_000 <= count <= 1_000_000
     color, filled, raw = batch()
+    # Filling took this one out.
+    raw[0, 5, 7] = 2 * filled[0, 5, 7]
     with torch.no_grad():
-        torch.testing.assert_close(net(tiny_inputs(color, filled, raw), filled), filled)
         net = shaken(net)
         x = tiny_inputs(color, filled, raw)
         out = net(x, filled)
         ratio = (out / filled).log()
-        assert ratio.std() > 0.05
+        kept = raw == filled
+        assert 0.6 < kept.float().mean() < 0.8
+        assert (ratio[kept] == 0).all()
+        assert ratio[~kept].std() > 0.05
+        assert ratio[0, 5, 7] != 0
         assert ratio.abs().max() <= 2.0001
         torch.testing.assert_close(net(x, 3 * filled), 3 * out)
         # Inputs are free of the scale of the scene.
         torch.testing.assert_close(tiny_inputs(color, 5 * filled, 5 * raw), x)
 
 
+def test_tiny_begins_on_the_way_from_filled_depth_to_the_plane_around() -> None:
+    y, x = torch.meshgrid(torch.arange(64.0), torch.arange(96.0), indexing="ij")
+    plane = (0.5 + 0.004 * x + 0.002 * y)[None]
+    hole = torch.zeros(1, 64, 96, dtype=torch.bool)
+    hole[:, 16:48, 32:64] = True
+    raw = torch.where(hole, 0, plane)
+    filled = torch.where(hole, 0.5 * plane, plane)
+    with torch.no_grad():
+        color = torch.zeros(1, 3, 64, 96)
+        out = Tiny(8).eval()(tiny_inputs(color, filled, raw), filled)
+        # All three guesses are the plane: 3 parts of sigmoid(-2), less what is too little to move.
+        expected = 3 / (1 + math.exp(2)) * math.log(2) - 0.07
+        torch.testing.assert_close((out / filled).log()[hole], torch.full([32 * 32], expected), atol=0.01, rtol=0)
+
+
+def slow_plane(q: Any, known: Any, y: int, x: int, power: float) -> float:
+    """The plane of best fit over cells of 8x8 at one of them, in 64-bit floats and by least squares."""
+    rows, wanted = [], []
+    for i in range(q.shape[0] // 8):
+        for j in range(q.shape[1] // 8):
+            at = np.s_[8 * i : 8 * i + 8, 8 * j : 8 * j + 8]
+            if known[at].any():
+                mean = q[at][known[at]].mean()
+                d2 = (i - y) ** 2 + (j - x) ** 2
+                near = sum(s**-6.0 * math.exp(-d2 / (2 * s * s)) for s in (0.5, 1, 2, 4, 8, 16, 32))
+                w = math.sqrt(known[at].mean() * near * mean**power)
+                rows.append([w, w * (i - y) / 64, w * (j - x) / 64])
+                wanted.append(w * mean)
+    # The ridge is on the slopes.
+    rows += [[0, math.sqrt(RIDGE * sum(r[0] ** 2 for r in rows)), 0]]
+    rows += [[0, 0, rows[-1][1]]]
+    return float(np.linalg.lstsq(np.array(rows), np.array([*wanted, 0, 0]), rcond=None)[0][0])
+
+
+def test_planes_are_lines_of_best_fit_through_what_was_measured() -> None:
+    rng = np.random.default_rng(4)
+    q = rng.uniform(0.5, 2, (6, 8)).repeat(8, 0).repeat(8, 1) + rng.normal(0, 0.05, (48, 64))
+    known = rng.random((48, 64)) < 0.4
+    known[8:24, 16:40] = False
+    tensors = [torch.from_numpy((a * known).astype(np.float32))[None, None] for a in (q, np.ones_like(q))]
+    got, features = planes(*tensors)
+    assert got.shape == (1, 3, 6, 8)
+    assert features.shape == (1, 9, 6, 8)
+    assert features.isfinite().all()
+    for of, power in enumerate(GUESSES):
+        for y in range(6):
+            for x in range(8):
+                assert got[0, of, y, x].item() == pytest.approx(slow_plane(q, known, y, x, power), rel=1e-3)
+    nothing = planes(*(torch.zeros(1, 1, 16, 32) for _ in range(2)))
+    assert all(n.isfinite().all() for n in nothing)
+
+
 def test_tiny_as_onnx_has_the_same_numbers_at_other_sizes(tmp_path: Path) -> None:
     onnxruntime = pytest.importorskip("onnxruntime", reason="onnxruntime is not installed (requirements-lab.txt)")
-    net = shaken(Tiny(16))
+    net = shaken(Tiny(16)).eval()
     export_tiny(net, tmp_path / "tiny.onnx")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1

@@ -306,6 +306,30 @@ def test_the_refine_loss_is_its_definition(missing: float) -> None:
     assert not nothing.grad.any()
 
 
+def test_the_loss_beside_fill_is_its_definition() -> None:
+    rng = np.random.default_rng(3)
+    t = np.where(rng.random((4, 7, 9)) < 0.3, 0, rng.uniform(0.05, 7, (4, 7, 9)))
+    filled, p = rng.uniform(0.2, 2, t.shape), rng.uniform(0.2, 2, t.shape)
+    filled[0, :2] = 0
+    p[1] = filled[1] + 0.8 * (1 / np.maximum(t[1], 0.2) - filled[1])  # better
+    t[3] = 0
+    c = config.LossConfig(space="fill", worse=2.0)
+    losses_of = []
+    for i in range(4):
+        at = (t[i] >= 0.1) & (t[i] <= 6) & (filled[i] > 0)
+        before, now = (abs(1 / of[i][at] - t[i][at]).sum() / max(at.sum(), 1) for of in (filled, p))
+        change = now - before
+        losses_of.append(change / (before + 0.1) + 2 * max(change, 0) / (before + 0.01))
+    assert min(losses_of) < -0.1
+    assert max(losses_of) > 0.05
+    of = [torch.from_numpy(a) for a in (p, t, filled)]
+    of[0].requires_grad_()
+    got = losses.beside_fill_loss(*of, c)
+    assert got.item() == pytest.approx(np.mean(losses_of), abs=1e-9)
+    got.backward()
+    assert of[0].grad.isfinite().all()
+
+
 def test_the_losses_of_noise_models() -> None:
     rng = np.random.default_rng(2)
     logits, raw = (

@@ -12,6 +12,7 @@ pub mod config;
 pub mod demo;
 pub mod doctor;
 pub mod edit;
+pub mod episode;
 pub mod eval;
 pub mod export;
 pub mod import;
@@ -51,6 +52,7 @@ pub fn run(cli: Cli) -> Result<Exit> {
         Command::Demo(args) => demo::run(&args, &context),
         Command::Run(args) => run::run(&args, &context),
         Command::Record(command) => record::run(&command, &context),
+        Command::Episode(command) => episode::run(&command, &context),
         Command::Status(args) => status::run(&args, &context),
         Command::Open(args) => open::run(&args, &context),
         Command::Top(args) => top::run(&args, &context),

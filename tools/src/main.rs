@@ -22,6 +22,7 @@ mod out;
 mod outfile;
 mod printable;
 mod progress;
+mod scratch;
 mod screen;
 mod signals;
 mod turbo;

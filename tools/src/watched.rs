@@ -29,10 +29,15 @@ pub fn watched<T>(
         if stop.is_asked() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
     });
     bar.clear();
-    result.map_err(|e| match e.kind() {
+    result.map_err(usage)
+}
+
+/// An error of a dataset as one of the command: bad input is a usage error.
+pub fn usage(e: depthrig_recorder::Error) -> anyhow::Error {
+    match e.kind() {
         ErrorKind::BadInput => UsageError(e.to_string()).into(),
         _ => e.into(),
-    })
+    }
 }
 
 /// Result of a resumable run that derives a dataset from another.

@@ -37,6 +37,7 @@ fn every_command_has_help_that_fits_and_an_entry_in_the_manual() {
         "status",
         "top",
         "replay",
+        "episode",
         "info",
         "report",
         "sessions",

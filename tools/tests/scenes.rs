@@ -35,6 +35,32 @@ fn a_run_makes_its_shards_once_and_says_what_it_did() {
 }
 
 #[test]
+fn worlds_are_written_as_meshes_and_not_twice() {
+    let folder = tempfile::tempdir().unwrap();
+    let worlds = folder.path().join("worlds");
+    let args = ["scenes", "--count", "1", "--size", "64x48", "--worlds", worlds.to_str().unwrap()];
+    Home::new().run(&args).good();
+    let world = worlds.join("0000000000");
+    let record = std::fs::read_to_string(world.join("world.json")).unwrap();
+    let record: serde_json::Value = serde_json::from_str(&record).unwrap();
+    let parts = record["parts"].as_array().unwrap();
+    for part in parts {
+        let bytes = std::fs::read(world.join(part["file"].as_str().unwrap())).unwrap();
+        let end = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
+        let head = core::str::from_utf8(&bytes[..end]).unwrap();
+        let count = |what: &str| {
+            let line = head.lines().find(|l| l.starts_with(what)).unwrap();
+            line.rsplit(' ').next().unwrap().parse::<usize>().unwrap()
+        };
+        assert_eq!(bytes.len() - end, count("element vertex") * 36 + count("element face") * 13);
+    }
+    let shown = image::open(world.join("part.png")).unwrap().into_luma16();
+    assert!(shown.pixels().all(|p| usize::from(p.0[0]) < parts.len()));
+    let again = Home::new().run(&args);
+    assert!(again.code != 0 && again.err.contains("exists"), "{}", again.err);
+}
+
+#[test]
 fn wrong_arguments_are_named() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().to_str().unwrap();

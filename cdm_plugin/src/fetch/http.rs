@@ -10,7 +10,33 @@ use ureq::{Agent, Body};
 
 const REDIRECTS: u32 = 10;
 
-/// Asks servers, with the computer's own root certificates and the proxies of its environment.
+/// An HTTP client for the server at `url`, with the computer's own root certificates and the proxies of its environment. It
+/// follows no redirect and takes no status for an error.
+pub fn agent(url: &str) -> Agent {
+    let provider = Arc::new(rustls::crypto::ring::default_provider());
+    let tls = TlsConfig::builder()
+        .provider(TlsProvider::Rustls)
+        .root_certs(RootCerts::PlatformVerifier)
+        .unversioned_rustls_crypto_provider(provider)
+        .build();
+    let config = Agent::config_builder()
+        .tls_config(tls)
+        .http_status_as_error(false)
+        // Followed by the caller: each answer is looked at, and what proves who asks goes to the first server alone.
+        .max_redirects(0)
+        .max_redirects_will_error(false)
+        .timeout_connect(Some(Duration::from_secs(30)))
+        .timeout_recv_response(Some(Duration::from_mins(1)))
+        .timeout_per_read(Some(Duration::from_mins(1)))
+        .timeout_per_write(Some(Duration::from_mins(1)))
+        .user_agent(concat!("depthrig/", env!("CARGO_PKG_VERSION")));
+    // This computer is never behind a proxy.
+    let here = ["127.0.0.1", "localhost", "[::1]"].contains(&host(url));
+    let config = if here { config.proxy(None) } else { config };
+    config.build().new_agent()
+}
+
+/// Asks servers.
 pub(super) struct Client {
     agent: Agent,
     token: Option<String>,
@@ -44,26 +70,7 @@ pub(super) enum Failure {
 impl Client {
     /// For files at `url`.
     pub(super) fn new(token: Option<String>, url: &str) -> Self {
-        let provider = Arc::new(rustls::crypto::ring::default_provider());
-        let tls = TlsConfig::builder()
-            .provider(TlsProvider::Rustls)
-            .root_certs(RootCerts::PlatformVerifier)
-            .unversioned_rustls_crypto_provider(provider)
-            .build();
-        let config = Agent::config_builder()
-            .tls_config(tls)
-            .http_status_as_error(false)
-            // Followed here: each answer is looked at, and what proves who asks goes to the first server alone.
-            .max_redirects(0)
-            .max_redirects_will_error(false)
-            .timeout_connect(Some(Duration::from_secs(30)))
-            .timeout_recv_response(Some(Duration::from_mins(1)))
-            .timeout_per_read(Some(Duration::from_mins(1)))
-            .user_agent(concat!("depthrig/", env!("CARGO_PKG_VERSION")));
-        // This computer is never behind a proxy.
-        let here = ["127.0.0.1", "localhost", "[::1]"].contains(&host(url));
-        let config = if here { config.proxy(None) } else { config };
-        Self { agent: config.build().new_agent(), token }
+        Self { agent: agent(url), token }
     }
 
     /// Asks for the file from byte `from` on; when its mark is still `etag`, if there is one.

@@ -9,8 +9,8 @@ use super::requests::{
 };
 use super::{SERVER_HEADER, allowed, guard, limits, live};
 use crate::control::{
-    CalibratedImage, CameraControls, Control, ControlChanges, ControlList, ControlRequest, RecordRequest,
-    ReplayControl, SeekRequest, StopRequest,
+    CalibratedImage, CameraControls, Control, ControlChanges, ControlList, ControlRequest, EpisodeRequest,
+    RecordRequest, ReplayControl, SeekRequest, StopRequest,
 };
 use crate::doctor::Examined;
 use crate::losses::RecordingLosses;
@@ -26,7 +26,7 @@ use axum::response::{IntoResponse, Response};
 use axum::routing::{MethodRouter, get, post};
 use axum::{Extension, Json, Router};
 use depthrig_recorder::fs::RealFs;
-use depthrig_recorder::{SessionChanges, edit};
+use depthrig_recorder::{Episode, SessionChanges, edit};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -52,7 +52,7 @@ pub struct Route {
 const CALIBRATION_EVENTS: &str = "/v1/calibration/events";
 
 /// Every call of the API.
-pub const ROUTES: [Route; 33] = [
+pub const ROUTES: [Route; 34] = [
     Route { method: "GET", path: "/v1/status", handler: || get(status) },
     Route { method: "GET", path: "/v1/health", handler: || get(health) },
     Route { method: "GET", path: "/v1/config", handler: || get(config) },
@@ -61,6 +61,7 @@ pub const ROUTES: [Route; 33] = [
     Route { method: "POST", path: "/v1/record/start", handler: || post(record_start) },
     Route { method: "POST", path: "/v1/record/stop", handler: || post(record_stop) },
     Route { method: "POST", path: "/v1/record/note", handler: || post(record_note) },
+    Route { method: "POST", path: "/v1/episode", handler: || post(episode) },
     Route { method: "GET", path: "/v1/recordings", handler: || get(recordings_list) },
     Route { method: "GET", path: "/v1/recordings/image", handler: || get(recordings_image) },
     Route { method: "POST", path: "/v1/recordings/mark", handler: || post(recordings_mark) },
@@ -262,6 +263,11 @@ async fn record_note(State(rig): State<Rig>, body: Bytes) -> Answer<StatusCode> 
     let note: NoteRequest = parse(&body)?;
     call(rig, move |rig| rig.record_note(&note.text)).await?;
     Ok(StatusCode::NO_CONTENT)
+}
+
+async fn episode(State(rig): State<Rig>, body: Bytes) -> Answer<Json<Episode>> {
+    let request: EpisodeRequest = parse(&body)?;
+    call(rig, move |rig| rig.episode(&request)).await.map(Json)
 }
 
 async fn replay(State(rig): State<Rig>) -> Answer<Json<ReplayStatus>> {

@@ -1,7 +1,7 @@
 //! A replay as the control API sees it: a rig whose cameras are datasets.
 
 use super::{Inner, lock};
-use crate::control::{Control, LiveRig, RecordRequest, ReplayControl, SeekRequest};
+use crate::control::{Control, EpisodeRequest, LiveRig, RecordRequest, ReplayControl, SeekRequest};
 use crate::losses::RecordingLosses;
 use crate::recording::{self, Begun, StreamFacts};
 use crate::rig::report;
@@ -12,7 +12,7 @@ use crate::status::{
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::{HostTime, Pose, UtcPair, shm};
-use depthrig_recorder::PixelMode;
+use depthrig_recorder::{Episode, PixelMode};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -266,6 +266,10 @@ impl Control for Inner {
 
     fn record_note(&self, text: &str) -> Result<()> {
         lock(&self.recording).note(text)
+    }
+
+    fn episode(&self, request: &EpisodeRequest) -> Result<Episode> {
+        lock(&self.recording).episode(request)
     }
 
     fn record_losses(&self) -> Option<RecordingLosses> {

@@ -4,14 +4,15 @@ use super::{Inner, controls, lock, report};
 use crate::Result;
 use crate::attached::System;
 use crate::control::{
-    CalibratedImage, CameraControls, Control, ControlChanges, ControlList, ControlRequest, LiveRig,
-    RecordRequest, Shows,
+    CalibratedImage, CameraControls, Control, ControlChanges, ControlList, ControlRequest, EpisodeRequest,
+    LiveRig, RecordRequest, Shows,
 };
 use crate::doctor::{self, Surroundings};
 use crate::losses::RecordingLosses;
 use crate::recording::{self, Begun};
 use crate::status::{RecordingStatus, RigStatus};
 use core::sync::atomic::Ordering;
+use depthrig_recorder::Episode;
 use depthrig_usb::SysRoot;
 use std::path::PathBuf;
 
@@ -99,6 +100,10 @@ impl Control for Inner {
 
     fn record_note(&self, text: &str) -> Result<()> {
         self.recording().note(text)
+    }
+
+    fn episode(&self, request: &EpisodeRequest) -> Result<Episode> {
+        self.recording().episode(request)
     }
 
     fn record_losses(&self) -> Option<RecordingLosses> {

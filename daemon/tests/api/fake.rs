@@ -1,14 +1,15 @@
 //! A scripted rig.
 
 use depthrig_daemon::control::{
-    CalibratedImage, Control, LossBucket, Losses, RecordRequest, RecordingLosses, ReplayControl, SeekRequest,
-    UncertaintyOfImage,
+    CalibratedImage, Control, EpisodeRequest, LossBucket, Losses, RecordRequest, RecordingLosses,
+    ReplayControl, SeekRequest, UncertaintyOfImage,
 };
 use depthrig_daemon::status::{
     CameraState, CameraStatus, ClockStatus, PreparingStatus, RecordingStatus, RefineState, RefineStatus,
     ReplayStatus, RigStatus, SetAccount, SetStatus, SharedMemoryStatus, StreamStatus,
 };
 use depthrig_daemon::{Error, ErrorKind, Result};
+use depthrig_recorder::Episode;
 use std::sync::{Condvar, Mutex};
 use std::time::Duration;
 
@@ -227,6 +228,22 @@ impl Control for Fake {
         let recording = running.ok_or_else(|| Error::new(ErrorKind::WrongState, "no recording goes on"))?;
         (recording.active, recording.error) = (false, Some("1 set was lost".into()));
         Ok(recording.clone())
+    }
+
+    fn episode(&self, request: &EpisodeRequest) -> Result<Episode> {
+        match request {
+            EpisodeRequest::Start { task } => Ok(Episode {
+                number: 1,
+                task: task.clone(),
+                start_utc_ns: 7,
+                end_utc_ns: None,
+                outcome: None,
+                discarded: false,
+                cut_start: false,
+                cut_end: false,
+            }),
+            _ => Err(Error::new(ErrorKind::WrongState, "no episode is running")),
+        }
     }
 
     fn record_note(&self, text: &str) -> Result<()> {

@@ -26,6 +26,7 @@ from ._layout import (
     SignalFlags,
     StageStep,
 )
+from ._recording import Episode, Recording
 from ._runtime import running_rigs
 from ._sets import FrameSet, Sets
 from ._signal import Signal, signals
@@ -44,6 +45,7 @@ from .errors import (
     DepthrigError,
     HoldingTooMany,
     RigNotRunning,
+    RigRefused,
     SignalChanged,
     SignalGap,
     SignalNotFound,
@@ -70,6 +72,7 @@ __all__ = [
     "DepthrigError",
     "Distortion",
     "DropReason",
+    "Episode",
     "ExternalCamera",
     "ExternalClock",
     "ExternalMode",
@@ -86,8 +89,10 @@ __all__ = [
     "MotionFlags",
     "PixelFormat",
     "Pose",
+    "Recording",
     "Refinement",
     "RigNotRunning",
+    "RigRefused",
     "SetReader",
     "Sets",
     "Signal",

@@ -11,6 +11,15 @@ class RigNotRunning(DepthrigError):
     """The rig is not running; the message names those that are."""
 
 
+class RigRefused(DepthrigError):
+    """The rig refuses a call; the message says why and what to do."""
+
+    def __init__(self, message: str, kind: str) -> None:
+        super().__init__(message)
+        self.kind = kind
+        """`bad_input`, `not_found`, `in_use`, `wrong_state`, `no_space`, `permission_denied`, `unreachable` or `other`."""
+
+
 class AmbiguousRig(DepthrigError):
     """Several rigs run and none was named."""
 

@@ -2,7 +2,7 @@
 
 use super::folder::{FolderState, OutFile, Output};
 use super::report::{ExportReport, PartRecord, StreamCount};
-use super::source::{PART_SETS, Part, Source};
+use super::source::{EpisodeUse, PART_SETS, Part, Source};
 use crossbeam::channel::{Sender, bounded};
 use depthrig_bus::sync::lock;
 use depthrig_recorder::fs::Fs;
@@ -22,6 +22,11 @@ use std::sync::{Mutex, PoisonError};
 pub trait Exporter: Sync {
     /// The name of the layout.
     fn format(&self) -> &'static str;
+
+    /// The sets of a dataset with episodes that are exported.
+    fn episodes(&self) -> EpisodeUse {
+        EpisodeUse::Kept
+    }
 
     /// The options that decide what is written, as recorded in `export.json`. A folder is resumed with equal ones only.
     fn options(&self) -> Value;
@@ -256,7 +261,10 @@ pub fn export(
     datasets.iter().try_for_each(|d| depthrig_recorder::check_outside(out, d.path()))?;
     let filters: Vec<String> =
         datasets.iter().filter_map(|d| d.filter().map(|f| f.name().to_owned())).collect();
-    let sources: Vec<_> = datasets.into_iter().map(Source::new).collect::<Result<_>>()?;
+    let mut sources = Vec::new();
+    for dataset in datasets {
+        sources.extend(Source::all_of(&dataset, exporter.episodes())?);
+    }
     let plan = exporter.plan(&sources)?;
     let mut options_written = exporter.options();
     if let Some(written) = options_written.as_object_mut().filter(|_| !filters.is_empty()) {
@@ -266,13 +274,19 @@ pub fn export(
         format: exporter.format().to_owned(),
         depthrig_version: env!("CARGO_PKG_VERSION").to_owned(),
         options: options_written,
-        datasets: sources.iter().map(|s| s.identity(fs)).collect::<Result<_>>()?,
+        datasets: firsts(&sources).map(|s| s.identity(fs)).collect::<Result<_>>()?,
         streams: Vec::new(),
         sets: 0,
         frames: 0,
         files: 0,
         bytes: 0,
-        losses: plan.losses.iter().cloned().chain(sources.iter().filter_map(motion)).chain(filters).collect(),
+        losses: [
+            plan.losses.clone(),
+            firsts(&sources).filter_map(Source::left_out).collect(),
+            firsts(&sources).filter_map(motion).collect(),
+            filters,
+        ]
+        .concat(),
         counters: std::collections::BTreeMap::new(),
         lost: 0,
         problems: Vec::new(),
@@ -314,7 +328,7 @@ pub fn export(
     exporter.finish(&sources, &parts, &out)?;
     let after = out.written();
     (report.files, report.bytes) = (after.0 - before.0, after.1 - before.1);
-    for source in &sources {
+    for source in firsts(&sources) {
         for problem in source.problems() {
             report.lost += 1;
             report.problems.push(problem.clone());
@@ -331,6 +345,11 @@ pub fn export(
     Ok(report)
 }
 
+/// One source of each dataset.
+fn firsts(sources: &[Source]) -> impl Iterator<Item = &Source> {
+    sources.iter().filter(|s| s.is_first())
+}
+
 /// The loss of a dataset with IMUs, whose samples no layout takes.
 fn motion(source: &Source) -> Option<String> {
     let units: Vec<_> = source.session().motion.iter().map(|u| u.id.to_string()).collect();
@@ -343,10 +362,15 @@ fn motion(source: &Source) -> Option<String> {
 
 fn streams(sources: &[Source], parts: &Parts<'_>) -> Vec<StreamCount> {
     let mut counts = Vec::new();
-    for (i, source) in sources.iter().enumerate() {
+    // Sources of one dataset follow each other.
+    let mut end = 0;
+    for dataset in sources.chunk_by(|_, next| !next.is_first()) {
+        let range = end..end + dataset.len();
+        end = range.end;
+        let source = &dataset[0];
         for (stream, s) in source.session().streams.iter().enumerate() {
             let of = |counts: fn(&PartRecord) -> &[u64]| {
-                let of_source = parts.iter().filter(|(p, _)| p.source == i);
+                let of_source = parts.iter().filter(|(p, _)| range.contains(&p.source));
                 of_source.map(|(_, r)| counts(r).get(stream).copied().unwrap_or(0)).sum()
             };
             counts.push(StreamCount {

@@ -14,7 +14,7 @@ mod schema;
 mod stats;
 mod table;
 
-use super::{Exporter, Output, Part, PartOut, PartSets, Parts, Plan, Source};
+use super::{EpisodeUse, Exporter, Output, Part, PartOut, PartSets, Parts, Plan, Source};
 use depthrig_bus::StreamId;
 use depthrig_recorder::{Error, ErrorKind, Result};
 use serde::Serialize;
@@ -66,6 +66,10 @@ impl Lerobot {
 impl Exporter for Lerobot {
     fn format(&self) -> &'static str {
         "lerobot"
+    }
+
+    fn episodes(&self) -> EpisodeUse {
+        EpisodeUse::Each
     }
 
     fn options(&self) -> Value {

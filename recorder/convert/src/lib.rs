@@ -9,7 +9,8 @@
 //! An [`Importer`] reads one layout and is driven by [`import`], which records a dataset and verifies it.
 //!
 //! Layer 4. [`kinect`] reads recordings of an Azure Kinect; [`recalibrate`] plans another calibration of a dataset; [`relabel`](mod@relabel) and [`zed_replay`](mod@zed_replay) add
-//! depth to datasets; [`scenes`] writes random scenes as training data.
+//! depth to datasets; [`scenes`] writes random scenes as training data. [`store`] is where work of many
+//! machines lies.
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
 
 mod bytecamera;
@@ -24,8 +25,10 @@ pub mod recalibrate;
 pub mod relabel;
 mod report;
 mod rosbag;
+mod run_part;
 pub mod scenes;
 mod source;
+pub mod store;
 pub mod zed_replay;
 
 pub use bytecamera::{ByteCameraExport, ByteCameraImport, ByteCameraOptions, CameraNames};
@@ -34,4 +37,5 @@ pub use folder::{OutFile, Output};
 pub use import::{ImportFacts, ImportProgress, ImportReport, Importer, import};
 pub use report::{DatasetIdentity, ExportReport, PartRecord, REPORT_FILE, SegmentIdentity, StreamCount};
 pub use rosbag::RosbagImport;
-pub use source::{PART_SETS, Part, Source};
+pub use run_part::RunPart;
+pub use source::{EpisodeUse, PART_SETS, Part, Source};

@@ -17,14 +17,18 @@ use depthrig_recorder::{
     Session, VerifyReport,
 };
 use refine::Refine;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use write::Write;
 
+mod pieces;
 mod refine;
 mod write;
+
+pub use pieces::{PieceAccount, PieceSource, Pieces, PiecesReport, SkippedPiece, relabel_pieces};
 
 /// How a dataset is given refined depth.
 #[derive(Debug, Clone, PartialEq)]
@@ -75,7 +79,7 @@ pub struct RelabelReport {
 }
 
 /// A stream of refined depth.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RelabelledStream {
     /// Its name.
     pub stream: String,
@@ -87,6 +91,23 @@ pub struct RelabelledStream {
     pub note: Option<String>,
     /// Frames in the new dataset.
     pub frames: u64,
+    /// Sets that lack colour or depth, and therefore have none.
+    pub unpaired: u64,
+    /// Pixels of all refined images.
+    pub pixels: u64,
+    /// Pixels that had no depth in the view of colour.
+    pub holes_before: u64,
+    /// Pixels that have none now.
+    pub holes: u64,
+}
+
+/// Form of the result.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Form {
+    /// A copy of it.
+    Whole,
+    /// A dataset of one of its segments, with bytes that depend on that and the refiner alone.
+    Piece,
 }
 
 /// A camera that gets refined depth.
@@ -136,14 +157,31 @@ pub fn relabel_with(
     options: &RelabelOptions,
     progress: RelabelProgress<'_>,
 ) -> Result<RelabelReport> {
-    let fs: Arc<dyn Fs> = Arc::new(RealFs);
     depthrig_recorder::check_outside(out, dataset.path())?;
-    let work = work_folder(out)?;
     if out.symlink_metadata().is_ok() {
         let message = format!("{} is there already; choose another name", out.display());
         return Err(Error::new(ErrorKind::AlreadyExists, message));
     }
-    let (cameras, engines) = plan(refiners, dataset.session(), options)?;
+    let planned = plan(refiners, dataset.session(), options)?;
+    make(refiners, planned, dataset, out, options, Form::Whole, &mut |_, _| Ok(()), progress)
+}
+
+/// Called with the new dataset, which has a name of its own yet, before it gets that of `out`.
+type Finish<'a> = &'a mut dyn FnMut(&Path, &RelabelReport) -> Result<()>;
+
+#[allow(clippy::too_many_arguments)] // two callers, in this module
+fn make(
+    refiners: &dyn Refiners,
+    (cameras, engines): (Vec<Camera>, Vec<Engine>),
+    dataset: &Dataset,
+    out: &Path,
+    options: &RelabelOptions,
+    form: Form,
+    finish: Finish<'_>,
+    progress: RelabelProgress<'_>,
+) -> Result<RelabelReport> {
+    let fs: Arc<dyn Fs> = Arc::new(RealFs);
+    let work = work_folder(out)?;
     let mut refine = Refine { refiners, cameras: &cameras, engines: &engines, options };
     let exported = export(
         &*fs,
@@ -155,7 +193,7 @@ pub fn relabel_with(
     )?;
     let mut report = RelabelReport {
         path: out.to_owned(),
-        streams: streams(&cameras, &engines),
+        streams: streams(&cameras, &engines, &exported.counters),
         sets: 0,
         bytes: 0,
         parts_resumed: exported.parts_resumed,
@@ -177,8 +215,8 @@ pub fn relabel_with(
         Error::new(ErrorKind::Io, format!("cannot {what} {}: {e}", path.display())).with_source(e)
     };
     remove(&copy).map_err(|e| failed("remove", &copy, e))?;
-    let mut write = Write::new(dataset, out, &work.join("refined"), &cameras, &engines)?;
-    let recorder = recorder_options(dataset)?;
+    let mut write = Write::new(dataset, out, &work.join("refined"), &cameras, &engines, form)?;
+    let recorder = recorder_options(dataset, form)?;
     let copied =
         import(&mut write, Arc::clone(&fs), &copy, recorder, &mut |p| progress(Step::Write, p.done, p.total));
     let copied = copied?;
@@ -202,6 +240,7 @@ pub fn relabel_with(
         report.problems.push(lost.message.clone());
     }
     report.verified = Some(copied.verified);
+    finish(&copy, &report)?;
     fs.rename(&copy, out).map_err(|e| failed("rename", &copy, e))?;
     let parent = folder_of(out);
     fs.sync_dir(parent).map_err(|e| failed("sync the folder", parent, e))?;
@@ -222,12 +261,17 @@ fn work_folder(out: &Path) -> Result<PathBuf> {
     Ok(out.with_file_name(name))
 }
 
-/// The cameras that get refined depth, each with its engine.
-fn plan(
-    refiners: &dyn Refiners,
-    session: &Session,
-    options: &RelabelOptions,
-) -> Result<(Vec<Camera>, Vec<Engine>)> {
+/// Streams of a camera that can get refined depth.
+struct Pair {
+    /// Indices in the session.
+    color: usize,
+    depth: usize,
+    /// The new stream.
+    id: StreamId,
+}
+
+/// The cameras of a dataset that can get refined depth; at least one.
+fn pairs(session: &Session) -> Result<Vec<Pair>> {
     let bad = |message: String| Error::new(ErrorKind::BadInput, message);
     let find = |camera: &str, stream: &str| {
         let is = |s: &depthrig_recorder::StreamRecord| {
@@ -235,8 +279,7 @@ fn plan(
         };
         session.streams.iter().position(is)
     };
-    let mut cameras: Vec<Camera> = Vec::new();
-    let mut engines: Vec<Engine> = Vec::new();
+    let mut pairs: Vec<Pair> = Vec::new();
     for (color, record) in session.streams.iter().enumerate().filter(|(_, s)| s.id.stream.as_str() == "color")
     {
         let name = record.id.camera.as_str();
@@ -248,6 +291,27 @@ fn plan(
         }
         let stream = StreamName::new(REFINED).map_err(|e| bad(e.to_string()))?;
         let id = StreamId { camera: record.id.camera.clone(), stream };
+        pairs.push(Pair { color, depth, id });
+    }
+    if pairs.is_empty() {
+        let names: Vec<_> = session.streams.iter().map(|s| s.id.to_string()).collect();
+        return Err(bad(format!(
+            "no camera of the dataset has both color and depth; it has {}",
+            names.join(", ")
+        )));
+    }
+    Ok(pairs)
+}
+
+/// The cameras that get refined depth, each with its engine.
+fn plan(
+    refiners: &dyn Refiners,
+    session: &Session,
+    options: &RelabelOptions,
+) -> Result<(Vec<Camera>, Vec<Engine>)> {
+    let mut cameras: Vec<Camera> = Vec::new();
+    let mut engines: Vec<Engine> = Vec::new();
+    for Pair { color, depth, id } in pairs(session)? {
         let plan = refiners.plan(&options.refine, &session.streams[depth].model);
         let note = plan.note.clone();
         let engine = if let Some(at) = engines.iter().position(|e| e.plan.is_as(&plan)) {
@@ -257,13 +321,6 @@ fn plan(
             engines.len() - 1
         };
         cameras.push(Camera { color, depth, id, engine, note });
-    }
-    if cameras.is_empty() {
-        let names: Vec<_> = session.streams.iter().map(|s| s.id.to_string()).collect();
-        return Err(bad(format!(
-            "no camera of the dataset has both color and depth; it has {}",
-            names.join(", ")
-        )));
     }
     Ok((cameras, engines))
 }
@@ -280,27 +337,41 @@ fn cannot(plan: &Plan, e: &depthrig_cdm::Error) -> Error {
     Error::new(ErrorKind::BadInput, format!("{}: {e}", plan.describe())).with_source(e.clone())
 }
 
-fn streams(cameras: &[Camera], engines: &[Engine]) -> Vec<RelabelledStream> {
+fn streams(
+    cameras: &[Camera],
+    engines: &[Engine],
+    counters: &BTreeMap<String, u64>,
+) -> Vec<RelabelledStream> {
     let of = |camera: &Camera| {
         let engine = &engines[camera.engine];
+        let count = |what| counters.get(&refine::counter(camera, what)).copied().unwrap_or(0);
         RelabelledStream {
             stream: camera.id.to_string(),
             engine: engine.description.engine.clone(),
             model: engine.description.model.clone(),
             note: engine.note.clone().or_else(|| camera.note.clone()),
             frames: 0,
+            unpaired: count(refine::UNPAIRED),
+            pixels: count(refine::PIXELS),
+            holes_before: count(refine::HOLES_BEFORE),
+            holes: count(refine::HOLES),
         }
     };
     cameras.iter().map(of).collect()
 }
 
 /// Images are stored as they are in the source; the first readable set shows how.
-fn recorder_options(dataset: &Dataset) -> Result<RecorderOptions> {
+fn recorder_options(dataset: &Dataset, form: Form) -> Result<RecorderOptions> {
     let mut reader = dataset.set_reader()?;
     let numbers = 0..reader.times().len();
     let first = numbers.into_iter().find_map(|n| reader.read(n, PixelMode::Stored).ok());
     let codecs: Vec<&str> = first.iter().flat_map(|s| s.frames.iter().map(|f| f.codec)).collect();
     let mut options = RecorderOptions { compression: Compression::Zstd1, ..RecorderOptions::default() };
+    if form == Form::Piece {
+        // What is written each second would depend on how fast this computer is. An unfinished piece is begun anew anyway.
+        options.sync_interval_ns = i64::MAX;
+        (options.segment_max_bytes, options.segment_max_ns) = (u64::MAX, i64::MAX);
+    }
     options.color = match () {
         () if codecs.contains(&"jpeg") => ColorCodec::Jpeg,
         () if codecs.contains(&"png") => ColorCodec::Png,

@@ -4,20 +4,27 @@
 //! is left alone, and sample `i` depends on the run's arguments and `i` alone: so a run that was killed goes on where
 //! it was, and any part can be made on any computer with the same bytes.
 
+use crate::RunPart;
+use crate::store::{Place, Remote};
 use core::sync::atomic::{AtomicU64, Ordering};
 use depthrig_bus::HostTime;
 use depthrig_bus::clock::process_cpu_ns;
 use depthrig_recorder::{Error, ErrorKind, Result};
-use depthrig_sim::synthetic::scenes::{Generator, Sensor, TriangleMesh};
+use depthrig_sim::synthetic::scenes::{Generator, Sensor, TriangleMesh, Triplet};
 use serde::Serialize;
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{self, BufWriter};
+use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
+mod dataset;
 mod sample;
 mod tar;
+mod world;
 
+pub use dataset::SceneSets;
 pub use sample::contact_sheet;
+pub use world::write_world;
 
 /// Version of the layout.
 pub const FORMAT: u32 = 1;
@@ -31,14 +38,16 @@ const BATCH: usize = 8;
 pub struct Plan {
     /// Folder of the shards; made when missing.
     pub folder: PathBuf,
+    /// Where each shard goes from there, if they go to a bucket.
+    pub remote: Option<Remote>,
     /// First part of the shards' names.
     pub name: String,
     /// Samples of the whole run.
     pub count: u64,
     /// Samples of a shard.
     pub per_shard: u64,
-    /// This part, from 0, and the number of parts: every `n`th shard.
-    pub part: (u64, u64),
+    /// This part: of the shards.
+    pub part: RunPart,
     /// Threads.
     pub threads: usize,
 }
@@ -72,7 +81,28 @@ impl Plan {
 
     /// Path of a shard.
     pub fn path(&self, shard: u64) -> PathBuf {
-        self.folder.join(format!("{}-{shard:06}.tar", self.name))
+        self.folder.join(self.file(shard))
+    }
+
+    /// Whether a shard is there and complete; an object is complete or not there.
+    fn is_whole(&self, shard: u64) -> Result<bool> {
+        match &self.remote {
+            None => Ok(tar::is_whole(&self.path(shard), self.samples(shard))),
+            Some(remote) => Ok(remote.size(&self.file(shard))?.is_some()),
+        }
+    }
+
+    /// Moves a complete shard to the bucket. If another machine has put it meanwhile, that one stays: it has the same bytes.
+    fn hand_over(&self, shard: u64) -> Result<()> {
+        let Some(remote) = &self.remote else { return Ok(()) };
+        let path = self.path(shard);
+        remote.put_file(&path, &self.file(shard))?;
+        std::fs::remove_file(&path).map_err(|e| Error::io("remove", &path, e))
+    }
+
+    /// Name of a shard's file.
+    fn file(&self, shard: u64) -> String {
+        format!("{}-{shard:06}.tar", self.name)
     }
 
     /// Numbers of the samples in a shard.
@@ -101,9 +131,13 @@ pub fn write(
     record(generator, plan)?;
     let start = HostTime::now();
     let cpu = process_cpu_ns();
-    let mine: Vec<u64> = (0..plan.shards()).filter(|s| s % plan.part.1 == plan.part.0).collect();
-    let is_missing = |s: &u64| !tar::is_whole(&plan.path(*s), plan.samples(*s));
-    let missing: Vec<u64> = mine.iter().copied().filter(is_missing).collect();
+    let mine: Vec<u64> = (0..plan.shards()).filter(|s| plan.part.has(*s)).collect();
+    let mut missing = Vec::new();
+    for shard in &mine {
+        if !plan.is_whole(*shard)? {
+            missing.push(*shard);
+        }
+    }
     let found = mine.len() - missing.len();
     let mut report = Report { shards: mine.len() as u64, shards_found: found as u64, ..Report::default() };
     let length = |s: &u64| plan.samples(*s).end - plan.samples(*s).start;
@@ -111,21 +145,21 @@ pub fn write(
     let mut done = total - missing.iter().map(length).sum::<u64>();
     let workers = workers(plan.threads)?;
     report.shards_missing = missing.len() as u64;
-    let mut go_on = progress(done, total);
+    if !progress(done, total) {
+        missing.clear();
+    }
     for shard in missing {
-        if !go_on {
-            break;
+        match one(generator, plan, shard, &workers, &mut |n| progress(done + n, total))? {
+            Made::Ended => break,
+            Made::Found => report.shards_found += 1,
+            Made::Bytes(bytes) => {
+                plan.hand_over(shard)?;
+                report.samples += length(&shard);
+                report.bytes += bytes;
+            }
         }
-        let made = one(generator, plan, shard, &workers, &mut |n| {
-            go_on = progress(done + n, total);
-            go_on
-        })?;
-        if let Some(bytes) = made {
-            done += length(&shard);
-            report.samples += length(&shard);
-            report.bytes += bytes;
-            report.shards_missing -= 1;
-        }
+        done += length(&shard);
+        report.shards_missing -= 1;
     }
     report.seconds = start.elapsed().as_secs_f64();
     report.cpu_seconds = (process_cpu_ns() - cpu) as f64 * 1e-9;
@@ -150,9 +184,6 @@ fn check(plan: &Plan) -> Result<()> {
     if plan.shards() > 1_000_000 {
         return bad(format!("{} shards are too many; put more samples into each", plan.shards()));
     }
-    if plan.part.0 >= plan.part.1 {
-        return bad(format!("invalid part {}/{}; parts are 0/n to n-1/n", plan.part.0, plan.part.1));
-    }
     Ok(())
 }
 
@@ -174,6 +205,9 @@ struct Arguments<'a> {
     cameras: &'a [String],
     sensor: &'static str,
     hide: f32,
+    /// Absent at 0: records of runs from before it stay as they are.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    again: Option<u64>,
     families: Vec<&'static str>,
     width: u32,
     height: u32,
@@ -211,6 +245,7 @@ fn record(generator: &Generator, plan: &Plan) -> Result<()> {
                 Sensor::Stereo => "stereo",
             },
             hide: s.hide,
+            again: (s.again > 0).then_some(s.again),
             families: s.families.iter().map(|f| f.name()).collect(),
             width: s.width,
             height: s.height,
@@ -220,24 +255,12 @@ fn record(generator: &Generator, plan: &Plan) -> Result<()> {
         samples: plan.count,
         shards: plan.shards(),
     };
-    let path = plan.folder.join(format!("{}.json", plan.name));
+    let name = format!("{}.json", plan.name);
+    let place = plan.remote.clone().map_or_else(|| Place::Local(plan.folder.clone()), Place::Remote);
     let mut text = serde_json::to_string_pretty(&record)
-        .map_err(|e| Error::new(ErrorKind::BadInput, format!("{}: {e}", path.display())))?;
+        .map_err(|e| Error::new(ErrorKind::BadInput, format!("{place}/{name}: {e}")))?;
     text.push('\n');
-    match depthrig_bus::files::read_to_string(&path, depthrig_bus::files::TEXT_MAX_BYTES) {
-        Ok(there) if there == text => Ok(()),
-        Ok(_) => Err(Error::new(
-            ErrorKind::BadInput,
-            format!(
-                "{} is of a run with other arguments or another version; give this run another folder or --name",
-                path.display()
-            ),
-        )),
-        Err(e) if e.kind() == io::ErrorKind::NotFound => {
-            depthrig_bus::files::replace(&path, text.as_bytes()).map_err(|e| Error::io("write", &path, e))
-        }
-        Err(e) => Err(Error::reading("read", &path, e)),
-    }
+    place.agree_on(&name, text.as_bytes(), "give this run another folder or --name")
 }
 
 /// Pools of one thread each: a sample is made on one thread, and several at once.
@@ -252,16 +275,29 @@ fn workers(threads: usize) -> Result<Vec<rayon::ThreadPool>> {
     (0..threads.max(1)).map(pool).collect()
 }
 
-/// Makes one shard; its bytes, or nothing when the work was ended.
+/// Result for a shard.
+enum Made {
+    /// It was made, of so many bytes.
+    Bytes(u64),
+    /// Another process has made it meanwhile.
+    Found,
+    /// The work was ended before.
+    Ended,
+}
+
+/// Makes one shard.
 fn one(
     generator: &Generator,
     plan: &Plan,
     shard: u64,
     workers: &[rayon::ThreadPool],
     progress: &mut dyn FnMut(u64) -> bool,
-) -> Result<Option<u64>> {
+) -> Result<Made> {
     let path = plan.path(shard);
     let part = Part::create(&path)?;
+    if plan.is_whole(shard)? {
+        return Ok(Made::Found);
+    }
     let mut out = tar::Tar::new(BufWriter::with_capacity(1 << 20, &part.file));
     let wrote = |e: io::Error| Error::io("write", &path, e);
     let all = plan.samples(shard);
@@ -276,18 +312,25 @@ fn one(
             }
         }
         if !progress(next - first) {
-            return Ok(None);
+            return Ok(Made::Ended);
         }
     }
     let bytes = out.finish().map_err(wrote)?;
     part.rename(&path).map_err(wrote)?;
-    Ok(Some(bytes))
+    Ok(Made::Bytes(bytes))
 }
 
 /// A shard that is being written. Dropped before it got its name, it is removed.
 struct Part {
     file: File,
-    path: PathBuf,
+    /// `None` once it was renamed: another process may have this name by then.
+    path: Option<PathBuf>,
+}
+
+/// Whether `path` is the name of this file.
+fn is_named(file: &File, path: &Path) -> bool {
+    let both = file.metadata().and_then(|open| Ok((open, path.metadata()?)));
+    both.is_ok_and(|(open, named)| (open.dev(), open.ino()) == (named.dev(), named.ino()))
 }
 
 impl Part {
@@ -295,34 +338,44 @@ impl Part {
         let mut name = shard.as_os_str().to_owned();
         name.push(".part");
         let path = PathBuf::from(name);
-        // One that a killed run left is written anew.
-        let options = OpenOptions::new().write(true).create(true).truncate(false).open(&path);
-        let file = options.map_err(|e| Error::io("create", &path, e))?;
-        match file.try_lock() {
-            Err(TryLockError::WouldBlock) => {
-                let what = format!(
-                    "{}: another process makes this shard; give each its own --shard",
-                    path.display()
-                );
-                return Err(Error::new(ErrorKind::InUse, what));
+        loop {
+            // One that a killed run left is written anew.
+            let options = OpenOptions::new().write(true).create(true).truncate(false).open(&path);
+            let file = options.map_err(|e| Error::io("create", &path, e))?;
+            match file.try_lock() {
+                Err(TryLockError::WouldBlock) => {
+                    let what = format!(
+                        "{}: another process makes this shard; give each its own --shard",
+                        path.display()
+                    );
+                    return Err(Error::new(ErrorKind::InUse, what));
+                }
+                // Some network file systems have no locks.
+                Err(TryLockError::Error(_)) | Ok(()) => {}
             }
-            // Some network file systems have no locks.
-            Err(TryLockError::Error(_)) | Ok(()) => {}
+            // Between opening and locking another process may have completed it: then this is the shard itself.
+            if is_named(&file, &path) {
+                file.set_len(0).map_err(|e| Error::io("write", &path, e))?;
+                return Ok(Self { file, path: Some(path) });
+            }
         }
-        file.set_len(0).map_err(|e| Error::io("write", &path, e))?;
-        Ok(Self { file, path })
     }
 
-    fn rename(self, to: &Path) -> io::Result<()> {
+    fn rename(mut self, to: &Path) -> io::Result<()> {
         self.file.sync_all()?;
-        std::fs::rename(&self.path, to)?;
+        if let Some(path) = &self.path {
+            std::fs::rename(path, to)?;
+        }
+        self.path = None;
         depthrig_bus::files::sync_folder_of(to)
     }
 }
 
 impl Drop for Part {
     fn drop(&mut self) {
-        drop(std::fs::remove_file(&self.path)); // gone already when it was renamed
+        if let Some(path) = &self.path {
+            drop(std::fs::remove_file(path));
+        }
     }
 }
 
@@ -341,10 +394,7 @@ fn make(
             if number >= batch.end {
                 return Ok::<_, Error>(made);
             }
-            let wrong = |e: depthrig_driver::Error| {
-                Error::new(ErrorKind::BadInput, format!("sample {number}: {e}")).with_source(e)
-            };
-            let triplet = generator.sample(number).map_err(wrong)?;
+            let triplet = sample_of(generator, number)?;
             made.push((number, sample::members(&triplet, generator.settings(), &mut fill)?));
         }
     };
@@ -359,6 +409,13 @@ fn make(
     }
     all.sort_unstable_by_key(|(number, _)| *number);
     Ok(all.into_iter().map(|(_, members)| members).collect())
+}
+
+/// A sample, or which one could not be made.
+fn sample_of(generator: &Generator, number: u64) -> Result<Triplet> {
+    generator
+        .sample(number)
+        .map_err(|e| Error::new(ErrorKind::BadInput, format!("sample {number}: {e}")).with_source(e))
 }
 
 #[cfg(test)]

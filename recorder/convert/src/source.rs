@@ -2,18 +2,33 @@
 
 use super::report::{DatasetIdentity, SegmentIdentity};
 use depthrig_recorder::fs::Fs;
-use depthrig_recorder::{Dataset, SetReader};
-use depthrig_recorder::{Error, Result, Session};
+use depthrig_recorder::{Dataset, Episode, Error, ErrorKind, Result, Session, SetReader};
 use std::ops::Range;
 
 /// Sets of a part at most: small enough that a killed export repeats little, large enough that opening a segment
 /// for it costs nothing.
 pub const PART_SETS: usize = 100;
 
-/// A dataset to be exported.
+/// The sets of a dataset with episodes that an export takes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum EpisodeUse {
+    /// All of them.
+    All,
+    /// Those that are in no discarded episode.
+    Kept,
+    /// Those of each used episode, as a source of its own.
+    Each,
+}
+
+/// A dataset to be exported, or one episode of it.
 pub struct Source {
     dataset: Dataset,
     reader: SetReader,
+    /// Numbers of the sets to be exported.
+    spans: Vec<Range<usize>>,
+    takes: EpisodeUse,
+    episode: Option<Episode>,
+    is_first: bool,
 }
 
 /// Consecutive sets of one segment, exported as one piece of work.
@@ -26,13 +41,82 @@ pub struct Part {
 }
 
 impl Source {
-    /// Reads the indexes of all segments; no set is read.
+    /// The parts of `dataset` to be exported, as one source, or as one for each of its episodes, when it has any. Of single episodes
+    /// those that were cut off are left out. Reads the indexes of all segments; no set is read.
     ///
     /// # Errors
-    /// [`depthrig_recorder::ErrorKind::Io`] when the disk cannot be read.
-    pub fn new(dataset: Dataset) -> Result<Self> {
+    /// [`ErrorKind::Io`] when the disk cannot be read, [`ErrorKind::BadInput`] when the dataset has episodes and none is left.
+    pub fn all_of(dataset: &Dataset, takes: EpisodeUse) -> Result<Vec<Self>> {
         let reader = dataset.set_reader()?;
-        Ok(Self { dataset, reader })
+        let episodes = if takes == EpisodeUse::All { Vec::new() } else { dataset.session().episodes.clone() };
+        let all = 0..reader.times().len();
+        let numbers = |e: &Episode| {
+            let times = reader.times();
+            let first = times.partition_point(|t| *t < e.start_utc_ns);
+            first..times.partition_point(|t| e.end_utc_ns.is_none_or(|end| *t <= end)).max(first)
+        };
+        let spans: Vec<(Vec<Range<usize>>, Option<Episode>)> = if episodes.is_empty() {
+            vec![(vec![all], None)]
+        } else if takes == EpisodeUse::Each {
+            let used = episodes.iter().filter(|e| e.is_used()).map(|e| (vec![numbers(e)], Some(e.clone())));
+            used.filter(|(spans, _)| !spans[0].is_empty()).collect()
+        } else {
+            vec![(without(all, episodes.iter().filter(|e| e.discarded).map(numbers)), None)]
+        };
+        if !episodes.is_empty() && spans.iter().all(|(spans, _)| spans.is_empty()) {
+            let path = dataset.path().display();
+            let n = episodes.len();
+            return Err(Error::new(
+                ErrorKind::BadInput,
+                format!(
+                    "{path}: none of its {n} episodes can be exported: discarded, cut off or empty; judge one with: depthrig edit \
+                     {path} --episode N=success"
+                ),
+            ));
+        }
+        let one = |(i, (spans, episode))| Self {
+            dataset: dataset.clone(),
+            reader: reader.fork(),
+            spans,
+            takes,
+            episode,
+            is_first: i == 0,
+        };
+        Ok(spans.into_iter().enumerate().map(one).collect())
+    }
+
+    /// The episode that it is; `None` for a dataset.
+    pub const fn episode(&self) -> Option<&Episode> {
+        self.episode.as_ref()
+    }
+
+    /// Whether it is the first one of its dataset.
+    pub const fn is_first(&self) -> bool {
+        self.is_first
+    }
+
+    /// Numbers of the sets to be exported, increasing.
+    pub fn numbers(&self) -> impl Iterator<Item = usize> + '_ {
+        self.spans.iter().cloned().flatten()
+    }
+
+    /// Which episodes and sets of its dataset are left out, in words; `None` for none.
+    pub fn left_out(&self) -> Option<String> {
+        if self.takes == EpisodeUse::All {
+            return None;
+        }
+        let session = self.session();
+        let is_out = |e: &&Episode| if self.episode.is_some() { !e.is_used() } else { e.discarded };
+        let mut left: Vec<_> = session
+            .episodes
+            .iter()
+            .filter(is_out)
+            .map(|e| format!("episode {} ({})", e.number, e.state()))
+            .collect();
+        if self.episode.is_some() {
+            left.push("sets outside of episodes".to_owned());
+        }
+        (!left.is_empty()).then(|| format!("{}: left out: {}", session.name, left.join(", ")))
     }
 
     /// The dataset.
@@ -72,7 +156,10 @@ impl Source {
             let end = segment.end;
             segment.step_by(most).map(move |at| Part { source, sets: at..end.min(at.saturating_add(most)) })
         };
-        self.segments().into_iter().flat_map(cut).collect()
+        let within = |segment: Range<usize>| {
+            self.spans.iter().map(move |span| span.start.max(segment.start)..span.end.min(segment.end))
+        };
+        self.segments().into_iter().flat_map(within).flat_map(cut).collect()
     }
 
     /// The facts that distinguish this dataset from any other, and from itself after a change.
@@ -95,4 +182,17 @@ impl Source {
             segments: self.dataset.segments().iter().map(segment).collect::<Result<_>>()?,
         })
     }
+}
+
+/// The numbers of `all` that are in none of `others`, which increase.
+fn without(all: Range<usize>, others: impl Iterator<Item = Range<usize>>) -> Vec<Range<usize>> {
+    let mut spans = Vec::new();
+    let mut at = all.start;
+    for other in others {
+        spans.push(at..other.start);
+        at = at.max(other.end);
+    }
+    spans.push(at..all.end);
+    spans.retain(|span| span.start < span.end);
+    spans
 }

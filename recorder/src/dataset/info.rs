@@ -27,6 +27,9 @@ pub struct DatasetInfo {
     pub scene: String,
     /// Who recorded it.
     pub operator: String,
+    /// Demonstrations within it.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub episodes: Vec<crate::Episode>,
     /// When it began, UTC nanoseconds since 1970.
     pub started_utc_ns: i64,
     /// Time from the first set to the last, nanoseconds.
@@ -295,6 +298,7 @@ pub(super) fn gather(dataset: &Dataset) -> Result<DatasetInfo> {
         rig: session.rig.clone(),
         scene: session.scene.clone(),
         operator: session.operator.clone(),
+        episodes: session.episodes.clone(),
         started_utc_ns: session.started_utc_ns,
         duration_ns: 0,
         sets: 0,

@@ -2,7 +2,7 @@
 
 use super::DiskStatus;
 use crate::msgs::SetCounts;
-use crate::{Error, Result};
+use crate::{EpisodeCounts, Error, Result};
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -26,6 +26,8 @@ pub struct Progress {
     pub duration_ns: i64,
     /// State of the disk.
     pub disk: DiskStatus,
+    /// Episodes so far.
+    pub episodes: EpisodeCounts,
     /// Why the recording ended before its time, if it did.
     #[serde(serialize_with = "as_text")]
     pub error: Option<Arc<Error>>,

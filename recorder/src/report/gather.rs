@@ -332,6 +332,7 @@ fn put_together(dataset: &Dataset, pass: Pass, messages: MessageSummary, images:
         depthrig_version: session.depthrig_version.clone(),
         started_utc_ns: session.started_utc_ns,
         notes: session.notes.clone(),
+        episodes: session.episodes.clone(),
         history: session.history.clone(),
         computed: session.computed.clone(),
         verdict: verdict::unknown(),

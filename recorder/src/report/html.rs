@@ -119,6 +119,7 @@ fn head(out: &mut String, r: &Report) {
     out.push_str("</dl>");
     let notes = r.notes.iter().map(|n| format!("{}: {}", utc_text(n.utc_ns), n.text));
     named_list(out, "Notes", notes.collect());
+    named_list(out, "Episodes", r.episodes.iter().map(crate::Episode::text).collect());
     named_list(out, "Computed, not captured", r.computed.iter().map(ToString::to_string).collect());
     let edits = r.history.iter().map(|e| match e.field.as_str() {
         "notes" => format!("{}: note added: {}", utc_text(e.utc_ns), e.after),

@@ -3,7 +3,7 @@
 //! Only `session.toml` changes, in one step; the segments keep the state at recording time. The file is
 //! edited as text: comments, order and keys that depthrig does not know stay as they are.
 
-use super::{Edit, Mark, Note, SESSION_FILE, Session, text_of};
+use super::{Edit, EpisodeEnd, Mark, Note, SESSION_FILE, Session, text_of};
 use crate::dataset::segments_in;
 use crate::fs::{self, Fs};
 use crate::{Error, ErrorKind, Result};
@@ -29,6 +29,8 @@ pub struct SessionChanges {
     pub notes: Vec<String>,
     /// A person's judgement; `Some(None)` takes it back.
     pub mark: Option<Option<Mark>>,
+    /// Judgements of episodes, by number.
+    pub episodes: Vec<(u32, EpisodeEnd)>,
 }
 
 /// Changes the session of the dataset `dir` and returns what was changed; an equal value is not
@@ -58,6 +60,9 @@ pub fn edit(fs: &dyn Fs, dir: &Path, changes: &SessionChanges) -> Result<Vec<Edi
     }
     if let Some(mark) = changes.mark {
         file.mark(mark)?;
+    }
+    for (number, end) in &changes.episodes {
+        file.episode(*number, *end)?;
     }
     file.save()
 }
@@ -198,6 +203,30 @@ impl<'a> SessionText<'a> {
         }
         let name = |mark: Option<Mark>| mark.map_or("", Mark::name).to_owned();
         self.log("mark", name(before), name(mark))
+    }
+
+    fn episode(&mut self, number: u32, end: EpisodeEnd) -> Result<()> {
+        let before = self.session.episodes.iter().find(|e| e.number == number).cloned();
+        let after = self.session.judge_episode(Some(number), end)?;
+        if before.as_ref() == Some(&after) {
+            return Ok(());
+        }
+        let is_it = |t: &Table| t.get("number").and_then(Item::as_integer) == Some(i64::from(number));
+        let tables = self.document.get_mut("episodes").and_then(Item::as_array_of_tables_mut);
+        // Without it the text is another session than it should be, and `save` refuses it.
+        if let Some(table) = tables.and_then(|tables| tables.iter_mut().find(|t| is_it(t))) {
+            match after.outcome {
+                Some(outcome) => drop(table.insert("outcome", toml_edit::value(outcome.name()))),
+                None => drop(table.remove("outcome")),
+            }
+            if after.discarded {
+                table.insert("discarded", toml_edit::value(true));
+            } else {
+                table.remove("discarded");
+            }
+        }
+        let before = before.map_or("", |e| e.state()).to_owned();
+        self.log(&format!("episode {number}"), before, after.state().to_owned())
     }
 
     fn note(&mut self, text: &str) -> Result<()> {

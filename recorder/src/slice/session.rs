@@ -25,6 +25,7 @@ pub(super) const AFTER: &str = "what came after set ";
 pub(super) fn trimmed(source: &Session, out: &Path, range: &Range) -> Session {
     let mut session = named(source, out);
     session.notes.retain(|n| range.has_note(n.utc_ns));
+    session.cut_episodes(range.from_utc_ns..=range.to_utc_ns, |utc_ns| range.has_note(utc_ns));
     session
 }
 
@@ -38,6 +39,7 @@ pub(super) fn merged(datasets: &[Dataset], out: &Path) -> Session {
         for note in other.notes.iter().filter(|n| !session.notes.contains(n)).cloned().collect::<Vec<_>>() {
             session.notes.push(note);
         }
+        session.join_episodes(&other.episodes);
         for step in other.derived.iter().filter(|d| !session.derived.contains(d)).cloned().collect::<Vec<_>>()
         {
             session.derived.push(step);

@@ -45,6 +45,7 @@ fn an_edit_changes_the_session_file_alone_and_is_in_the_history() {
         operator: Some(String::new()),
         notes: vec!["the cup was moved".into()],
         mark: Some(Some(Mark::Bad)),
+        episodes: Vec::new(),
     };
     let edits = edit(&fs, &dir(), &changes).unwrap();
     let expected = [

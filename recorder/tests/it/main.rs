@@ -8,6 +8,7 @@ mod compare;
 mod corpus;
 mod crash;
 mod edit;
+mod episodes;
 mod failures;
 mod kill;
 mod kill_busy;

@@ -6,6 +6,7 @@ use anyhow::Result;
 
 pub mod bench;
 pub mod fetch;
+mod pieces;
 pub mod relabel;
 pub mod run;
 pub mod store;

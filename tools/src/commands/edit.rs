@@ -9,7 +9,7 @@ use anyhow::Result;
 use depthrig_convert::recalibrate;
 use depthrig_recorder::fs::RealFs;
 use depthrig_recorder::utc_text;
-use depthrig_recorder::{Dataset, Edit, Mark, SessionChanges, edit, rename};
+use depthrig_recorder::{Dataset, Edit, EpisodeEnd, Mark, SessionChanges, edit, rename};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
@@ -45,6 +45,9 @@ pub struct EditArgs {
     /// Judge the recording; exports leave out what is marked bad
     #[arg(long, value_enum, value_name = "MARK")]
     mark: Option<MarkArg>,
+    /// Judge an episode: N=success, N=failure, N=none or N=discard; repeatable
+    #[arg(long = "episode", value_name = "N=JUDGEMENT", value_parser = super::episode::judgement)]
+    episodes: Vec<(u32, EpisodeEnd)>,
     /// Calibration of the mount to attach
     #[arg(long, value_name = "FILE")]
     calibration: Option<PathBuf>,
@@ -92,6 +95,7 @@ pub fn run(args: &EditArgs, context: &Context) -> Result<Exit> {
         operator: args.operator.clone(),
         notes: args.notes.clone(),
         mark: args.mark.map(MarkArg::mark),
+        episodes: args.episodes.clone(),
     };
     let asked = changes != SessionChanges::default() || args.rename.is_some() || args.calibration.is_some();
     let mut path = args.dataset.clone();

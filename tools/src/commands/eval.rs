@@ -2,7 +2,6 @@
 
 use super::cdm::run::precision;
 use super::cdm::store::Models;
-use super::scenes::part;
 use crate::context::Context;
 use crate::eval::page::{Pictures, page};
 use crate::eval::records::{Header, Reader, Writer, same_run};
@@ -20,6 +19,7 @@ use anyhow::{Result, bail};
 use depthrig_bus::Intrinsics;
 use depthrig_cdm::Precision;
 use depthrig_cdm::metrics::{DepthRange, Rules};
+use depthrig_convert::RunPart;
 use std::path::{Path, PathBuf};
 
 mod source;
@@ -110,8 +110,8 @@ pub struct EvalArgs {
     #[arg(long, value_name = "FILE")]
     sums: Option<PathBuf>,
     /// Part to evaluate: K of N, from 0; needs --sums
-    #[arg(long, value_name = "K/N", value_parser = part, requires = "sums", conflicts_with_all = ["out", "csv", "json"])]
-    shard: Option<[u64; 2]>,
+    #[arg(long, value_name = "K/N", requires = "sums", conflicts_with_all = ["out", "csv", "json"])]
+    shard: Option<RunPart>,
     /// Files of sums of all parts, to report as one run
     #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with_all = ["input", "pred", "refine", "truth", "sums", "shard"])]
     merge: Vec<PathBuf>,
@@ -205,7 +205,7 @@ pub fn run(args: &EvalArgs, context: &Context) -> Result<Exit> {
         },
     )?;
     let rows = refiners.rows(source.as_ref())?;
-    let part = args.shard.unwrap_or([0, 1]);
+    let part = args.shard.unwrap_or(RunPart::ALL);
     let header = Header::new(&title, part, rows, &rules, args.resize, source.left_out());
     let mut summary = Summary::new(rules);
     let mut pictures = Pictures::default();

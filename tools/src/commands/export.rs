@@ -37,7 +37,7 @@ pub enum ExportCommand {
     /// Export to the layout of ByteCameraDepth, with times and calibration
     #[command(after_help = bytecameradepth::EXAMPLES)]
     Bytecameradepth(bytecameradepth::Args),
-    /// Export to LeRobot v3.0: an episode per dataset, JPEG/PNG colour, TIFF depth
+    /// Export to LeRobot v3.0: an episode per episode, or per dataset without any; JPEG/PNG colour, TIFF depth
     #[command(after_help = lerobot::EXAMPLES)]
     Lerobot(lerobot::Args),
 }

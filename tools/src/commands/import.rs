@@ -10,10 +10,12 @@ use clap::ValueEnum;
 use core::ops::ControlFlow;
 use depthrig_bus::CameraName;
 use depthrig_convert::kinect::{KinectImport, KinectOptions};
+use depthrig_convert::scenes::SceneSets;
 use depthrig_convert::{ByteCameraImport, ByteCameraOptions, ImportReport, Importer, RosbagImport, import};
 use depthrig_kinect::playback::CalibrationSource;
 use depthrig_recorder::fs::{Fs, RealFs};
 use depthrig_recorder::{ColorCodec, RecorderOptions, check_outside};
+use depthrig_sim::synthetic::scenes::Generator;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -204,6 +206,13 @@ fn kinect(args: &KinectArgs) -> KinectOptions {
 
 fn name_of(out: &Path) -> String {
     out.file_name().unwrap_or_default().to_string_lossy().into_owned()
+}
+
+/// Records a run of random scenes as a dataset with lossless colour.
+pub fn scenes(generator: Generator, count: u64, out: &Path, json: bool, context: &Context) -> Result<Exit> {
+    let sets = SceneSets::new(generator, count, name_of(out)).map_err(super::export::usage)?;
+    let common = Common { out: out.to_owned(), color_codec: Color::Raw, json };
+    drive(&mut { sets }, Arc::new(RealFs), &common, context)
 }
 
 /// Runs an importer with a progress bar and prints its report.

@@ -118,6 +118,12 @@ fn text(info: &DatasetInfo, lost: &[String]) -> String {
             }),
         ),
     ];
+    if !info.episodes.is_empty() {
+        let used = info.episodes.iter().filter(|e| e.is_used()).count();
+        lines.push(String::new());
+        lines.push(format!("{}, {used} for exports", out::count(info.episodes.len(), "episode")));
+        lines.extend(info.episodes.iter().map(|e| format!("  {}", printable::line(&e.text()))));
+    }
     if !info.motion.is_empty() {
         lines.push(String::new());
         lines.push(out::table(

@@ -3,6 +3,7 @@
 use crate::context::Context;
 use crate::exit::Exit;
 use crate::out;
+use crate::printable;
 use anyhow::{Context as _, Result};
 use depthrig_daemon::client::Client;
 use depthrig_daemon::control::RecordRequest;
@@ -127,6 +128,14 @@ fn print_status(status: &RecordingStatus, json: bool) -> Result<Exit> {
         out::bytes(status.bytes),
         out::reasons(&status.dropped)
     ))?;
+    if let Some(last) = &status.episode {
+        let discarded = match status.episodes_discarded {
+            0 => String::new(),
+            n => format!(", {n} discarded"),
+        };
+        let kept = out::count(status.episodes, "episode");
+        out::line(format_args!("{kept}{discarded}; {}", printable::line(&last.text())))?;
+    }
     if let Some(e) = &status.error {
         out::line(format_args!("error: {e}"))?;
     }

@@ -11,9 +11,10 @@ use core::time::Duration;
 use depthrig_bus::sync::lock;
 use depthrig_bus::{HostTime, RuntimeDir};
 use depthrig_daemon::Showing;
-use depthrig_daemon::config::{Port, RigConfig};
+use depthrig_daemon::config::{CameraConfig, Port, RigConfig};
 use depthrig_daemon::control::{Control, RecordRequest, Shows};
 use depthrig_daemon::rig::{Rig, RigOptions, RigSummary};
+use depthrig_daemon::status::{CameraStatus, RefineState};
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 
@@ -64,6 +65,8 @@ pub fn run(args: &RunArgs, context: &Context) -> Result<Exit> {
     if let Some(port) = args.foxglove {
         config.control.foxglove = Port::loopback(port);
     }
+    let is_recorded = |camera: &&CameraConfig| camera.refine.as_ref().is_some_and(|r| r.record);
+    let refined: Vec<_> = config.cameras.iter().filter(is_recorded).map(|c| c.name.to_string()).collect();
     let stop = Stop::on_signals()?;
     let Started { rig, .. } = start(config, context.runtime()?, true, None, context.global.quiet > 0)?;
     if let Some(port) = rig.port().filter(|_| context.global.quiet == 0) {
@@ -72,6 +75,7 @@ pub fn run(args: &RunArgs, context: &Context) -> Result<Exit> {
     let control = rig.control();
     if let Some(directory) = &args.record
         && wait_until_drawn(&rig, &stop, context.global.quiet > 0)
+        && wait_for_refiners(&rig, &refined, &stop, context.global.quiet > 0)
     {
         let request = RecordRequest {
             directory: Some(directory.clone()),
@@ -108,6 +112,34 @@ fn wait_until_drawn(rig: &Rig, stop: &Stop, quiet: bool) -> bool {
         }
         announced = true;
         shown.set("rendering, then recording", p.done as u64, p.total as u64);
+        if rig.is_stop_asked() || stop.wait(LOOK) {
+            return false;
+        }
+    }
+    true
+}
+
+/// Waits until the refiners of these cameras run or have failed: the first sets of a recording would lack refined depth.
+/// Returns false when the rig was asked to stop meanwhile.
+fn wait_for_refiners(rig: &Rig, cameras: &[String], stop: &Stop, quiet: bool) -> bool {
+    const LOOK: Duration = Duration::from_millis(100);
+    let control = rig.control();
+    let mut shown = Progress::new(quiet);
+    let is_starting = |camera: &CameraStatus| {
+        cameras.contains(&camera.name)
+            && camera.refine.as_ref().is_some_and(|r| r.state == RefineState::Starting)
+    };
+    while !cameras.is_empty() {
+        let status = control.status();
+        let starting = status.cameras.iter().filter(|&c| is_starting(c)).count();
+        if starting == 0 {
+            break;
+        }
+        shown.set(
+            "starting refiners, then recording",
+            (cameras.len() - starting) as u64,
+            cameras.len() as u64,
+        );
         if rig.is_stop_asked() || stop.wait(LOOK) {
             return false;
         }

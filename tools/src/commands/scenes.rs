@@ -5,10 +5,14 @@ use crate::exit::{Exit, UsageError};
 use crate::out;
 use crate::outfile::{OutFile, Overwrite};
 use crate::progress::Progress;
+use crate::scratch::{Scratch, path_of};
 use crate::signals::Stop;
+use crate::watched::usage;
 use anyhow::{Result, bail};
 use clap::ValueEnum;
-use depthrig_convert::scenes::{self, Plan, contact_sheet};
+use depthrig_convert::RunPart;
+use depthrig_convert::scenes::{self, Plan, contact_sheet, write_world};
+use depthrig_convert::store::Place;
 use depthrig_sim::synthetic::scenes::{Family, Generator, Sensor, Settings, TriangleMesh, Triplet};
 use std::path::{Path, PathBuf};
 
@@ -20,6 +24,9 @@ same without holes (as the refiner fill fills them), and the material of each pi
 A sample depends on the arguments, the seed and its number alone. A shard has its name once it is complete; a run that
 was interrupted goes on where it was. --shard 0/4 makes the first of four parts, on this computer or another one.
 
+--worlds DIR writes each world of the run as a folder DIR/NUMBER: meshes (PLY) with colours, camera, lamps, and what
+the camera sees.
+
 Families: box, ball, superquadric, cup, bottle, bowl, plate, cutlery, cable, cloth, and mesh with --meshes.
 Cameras: d405, d415, d435, d455, l515, zed2i, kinect, generic.
 
@@ -30,14 +37,19 @@ Examples:
   depthrig scenes --seed 8 --count 500 --without bottle,cup --out train
   depthrig scenes --count 20000 --hide 0.5 --out train
   depthrig scenes --count 20000 --sensor stereo --shard 2/8 --out train
-  depthrig scenes --count 12 --preview sheet.png";
+  depthrig scenes --count 12 --preview sheet.png
+  depthrig scenes --count 50 --camera d435 --dataset data/random
+  depthrig scenes --count 8 --size 320x240 --worlds worlds";
 
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct ScenesArgs {
-    /// Folder of the shards
-    #[arg(long, value_name = "DIR", required_unless_present = "preview")]
+    /// Folder of the shards, or s3://BUCKET/PREFIX
+    #[arg(long, value_name = "DIR", required_unless_present_any = ["preview", "dataset", "worlds"])]
     out: Option<PathBuf>,
+    /// New dataset, instead of shards: a world each set, one camera with its nominal lens, and true depth
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["out", "per_shard", "shard", "scratch", "name", "threads"])]
+    dataset: Option<PathBuf>,
     /// Seed of the run
     #[arg(long, value_name = "N", default_value_t = 0)]
     seed: u64,
@@ -53,6 +65,9 @@ pub struct ScenesArgs {
     /// Share of the samples in which random regions of measured depth are hidden, 0 to 1
     #[arg(long, value_name = "SHARE", default_value_t = 0.0)]
     hide: f32,
+    /// Number of the measurement: another one draws sensor and noise anew, of the same worlds
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    again: u64,
     /// Width and height of the images, pixels
     #[arg(long, value_name = "WxH", default_value = "640x480", value_parser = size)]
     size: [u32; 2],
@@ -69,14 +84,19 @@ pub struct ScenesArgs {
     #[arg(long, value_name = "N", default_value_t = 500, value_parser = clap::value_parser!(u64).range(1..=100_000))]
     per_shard: u64,
     /// Part of the run to make: K of N, from 0
-    #[arg(long, value_name = "K/N", default_value = "0/1", value_parser = part)]
-    shard: [u64; 2],
+    #[arg(long, value_name = "K/N", default_value_t = RunPart::ALL)]
+    shard: RunPart,
+    #[command(flatten)]
+    scratch: Scratch,
     /// First part of the shards' names
     #[arg(long, value_name = "NAME", default_value = "scenes")]
     name: String,
     /// Image of the first samples: colour, true and measured depth
     #[arg(long, value_name = "FILE")]
     preview: Option<PathBuf>,
+    /// Folder for the worlds as meshes, for other renderers
+    #[arg(long, value_name = "DIR")]
+    worlds: Option<PathBuf>,
     #[command(flatten)]
     overwrite: Overwrite,
     /// Threads [default: all cores]
@@ -104,17 +124,6 @@ fn size(text: &str) -> Result<[u32; 2], String> {
     Ok([w.parse().map_err(|_| wrong())?, h.parse().map_err(|_| wrong())?])
 }
 
-/// Parses a part such as `2/8`.
-///
-/// # Errors
-/// When it is not one.
-pub fn part(text: &str) -> Result<[u64; 2], String> {
-    let wrong = || format!("write a part such as 2/8 (0/8 to 7/8), not \"{text}\"");
-    let (k, n) = text.split_once('/').ok_or_else(wrong)?;
-    let [k, n] = [k.parse().map_err(|_| wrong())?, n.parse().map_err(|_| wrong())?];
-    if k < n && n <= 1_000_000 { Ok([k, n]) } else { Err(wrong()) }
-}
-
 /// Makes the samples.
 pub fn run(args: &ScenesArgs, context: &Context) -> Result<Exit> {
     let generator = Generator::new(settings(args)?).map_err(|e| UsageError(e.to_string()))?;
@@ -134,14 +143,34 @@ pub fn run(args: &ScenesArgs, context: &Context) -> Result<Exit> {
         bar.clear();
         preview.write(&contact_sheet(&samples, generator.settings())?)?;
     }
-    let Some(folder) = &args.out else { return Ok(Exit::Good) };
+    if let Some(folder) = &args.worlds {
+        for number in 0..args.count {
+            bar.set("writing worlds", number, args.count);
+            write_world(&generator.world(number), generator.settings(), folder)?;
+            if stop.is_asked() {
+                bail!("interrupted after {} worlds", number + 1);
+            }
+        }
+        bar.clear();
+    }
+    if let Some(dataset) = &args.dataset {
+        return super::import::scenes(generator, args.count, dataset, args.json, context);
+    }
+    let Some(out) = &args.out else { return Ok(Exit::Good) };
+    let place = Place::parse(out).map_err(usage)?;
+    let scratch = args.scratch.folder(&[&place])?;
+    let (folder, remote) = match place {
+        Place::Local(folder) => (folder, None),
+        Place::Remote(remote) => (path_of(scratch.as_ref()), Some(remote)),
+    };
     let cores = || std::thread::available_parallelism().map_or(1, usize::from);
     let plan = Plan {
-        folder: folder.clone(),
+        folder,
+        remote,
         name: args.name.clone(),
         count: args.count,
         per_shard: args.per_shard,
-        part: args.shard.into(),
+        part: args.shard,
         threads: args.threads.map_or_else(cores, usize::from),
     };
     let report = scenes::write(&generator, &plan, &mut |done, total| {
@@ -149,10 +178,7 @@ pub fn run(args: &ScenesArgs, context: &Context) -> Result<Exit> {
         !stop.is_asked()
     });
     bar.clear();
-    let report = report.map_err(|e| match e.kind() {
-        depthrig_recorder::ErrorKind::BadInput => UsageError(e.to_string()).into(),
-        _ => anyhow::Error::new(e),
-    })?;
+    let report = report.map_err(usage)?;
     if args.json {
         out::json(&report)?;
     } else {
@@ -192,6 +218,8 @@ fn settings(args: &ScenesArgs) -> Result<Settings> {
             SensorName::Stereo => Sensor::Stereo,
         },
         hide: args.hide,
+        nominal_lens: args.dataset.is_some(),
+        again: args.again,
         families: all.into_iter().filter(|f| !args.without.contains(f)).collect(),
         meshes,
     })
@@ -231,11 +259,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn parts_and_sizes_are_checked() {
-        assert_eq!(part("2/8"), Ok([2, 8]));
-        for bad in ["8/8", "1", "-1/2", "a/b", "0/0", "1/2/3", "1/1000001"] {
-            assert!(part(bad).unwrap_err().contains("2/8"), "{bad}");
-        }
+    fn sizes_are_checked() {
         assert_eq!(size("640x480"), Ok([640, 480]));
         for bad in ["640", "640x", "x", "640x480x3", "-1x4"] {
             assert!(size(bad).unwrap_err().contains("640x480"), "{bad}");

@@ -4,6 +4,7 @@ use super::records::{Header, Reader, Record};
 use super::summary::{Evaluation, Summary};
 use crate::exit::UsageError;
 use anyhow::{Result, bail};
+use depthrig_convert::RunPart;
 use std::path::{Path, PathBuf};
 
 /// The evaluation that the files of all parts make together, as if it were one run, and its header.
@@ -15,7 +16,7 @@ pub fn merge(paths: &[PathBuf]) -> Result<(Evaluation, Header)> {
     readers.sort_by_key(|r| r.header.part);
     let Some(first) = readers.first() else { bail!(UsageError("name the files of all parts".into())) };
     let mut header = first.header.clone();
-    let parts = header.part[1];
+    let parts = header.part.parts();
     for other in &readers[1..] {
         if let Some(what) = header.difference(&other.header) {
             let text =
@@ -31,13 +32,13 @@ pub fn merge(paths: &[PathBuf]) -> Result<(Evaluation, Header)> {
         }
     }
     let missing: Vec<String> = (0..parts)
-        .filter(|k| !readers.iter().any(|r| r.header.part[0] == *k))
+        .filter(|k| !readers.iter().any(|r| r.header.part.number() == *k))
         .map(|k| format!("{k}/{parts}"))
         .collect();
     if !missing.is_empty() {
         bail!("parts are missing: run --shard {} and name their files too", missing.join(", --shard "));
     }
-    header.part = [0, 1];
+    header.part = RunPart::ALL;
     let mut summary = Summary::new(header.rules()?);
     let mut heads = readers.iter_mut().map(Reader::next).collect::<Result<Vec<Option<Record>>>>()?;
     let mut images = 0;

@@ -9,6 +9,7 @@ use super::refine::RowInfo;
 use anyhow::{Context, Result, bail};
 use depthrig_bus::files::sync_folder_of;
 use depthrig_cdm::metrics::{DepthRange, Measured, Rules};
+use depthrig_convert::RunPart;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions, TryLockError};
@@ -27,8 +28,8 @@ pub struct Header {
     pub program: String,
     /// The input.
     pub title: String,
-    /// This part, from 0, and the number of parts: every `n`th image.
-    pub part: [u64; 2],
+    /// This part: of the images.
+    pub part: RunPart,
     /// The rows.
     pub rows: Vec<RowInfo>,
     /// [`Rules`] as text: nearest and farthest reference, width of a bin.
@@ -47,7 +48,7 @@ impl Header {
     /// Of a run.
     pub fn new(
         title: &str,
-        part: [u64; 2],
+        part: RunPart,
         rows: Vec<RowInfo>,
         rules: &Rules,
         resized: bool,
@@ -99,7 +100,7 @@ impl Header {
                 ("range and bins", format!("{} {}", h.metres.join(" "), h.bins)),
                 ("--like-cdm", h.like_cdm.to_string()),
                 ("--resize", h.resized.to_string()),
-                ("number of parts", h.part[1].to_string()),
+                ("number of parts", h.part.parts().to_string()),
                 ("missing files", h.left_out.join("; ")),
             ]
         };
@@ -303,7 +304,7 @@ impl Writer {
 /// # Errors
 /// Says what differs.
 pub fn same_run(found: &Header, wanted: &Header, path: &Path) -> Result<()> {
-    let part = |h: &Header| format!("part {}/{} of {}", h.part[0], h.part[1], h.title);
+    let part = |h: &Header| format!("part {} of {}", h.part, h.title);
     let other = if part(found) == part(wanted) {
         found.difference(wanted)
     } else {

@@ -52,7 +52,6 @@ impl Run<'_> {
         sums: &mut Option<Writer>,
         mut go_on: impl FnMut(u64, u64) -> bool,
     ) -> Result<Option<u64>> {
-        let [part, parts] = self.header.part;
         let first = self.source.names().len();
         let mut units = Units::default();
         let mut next = 0;
@@ -63,7 +62,7 @@ impl Run<'_> {
             let mut jobs: Vec<(u64, Result<Job>)> = Vec::new();
             while jobs.len() < self.threads.max(1) {
                 let Some(job) = self.source.next() else { break };
-                let is_ours = next % parts == part;
+                let is_ours = self.header.part.has(next);
                 if is_ours && self.done > 0 {
                     self.done -= 1;
                 } else if is_ours {

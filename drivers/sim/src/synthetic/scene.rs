@@ -155,7 +155,8 @@ impl World {
         }
     }
 
-    fn room_paint(&self, n: Vec3) -> Paint {
+    /// The paint of the floor, a wall or the ceiling, by the normal.
+    pub(crate) fn room_paint(&self, n: Vec3) -> Paint {
         let (part, fixed) = match n.z {
             z if z > 0.5 => (0, Paint::Floor),
             z if z < -0.5 => (2, Paint::Ceiling),

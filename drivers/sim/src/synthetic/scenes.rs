@@ -19,7 +19,7 @@ use super::noise::mix;
 use super::random::{Draw, RandomWorld, Stock};
 use super::scene::World;
 use super::shape::Mesh;
-use super::texture::{DARK_ALBEDO, Surface};
+use super::texture::{DARK_ALBEDO, Paint, Surface};
 use super::view::{NOTHING, Rays, View};
 use depthrig_bus::{Intrinsics, Pose};
 use depthrig_calib::{PoseExt, Registration, same_view};
@@ -30,8 +30,10 @@ use std::sync::Arc;
 mod hide;
 mod ir;
 mod optics;
+mod world;
 
 pub use super::random::{Family, SceneKind};
+pub use world::{WorldLamp, WorldModel, WorldPart};
 
 /// Metres per count of true depth.
 pub const TRUTH_UNIT_M: f64 = 1e-4;
@@ -74,6 +76,10 @@ pub struct Settings {
     pub sensor: Sensor,
     /// Share of the samples in which random regions of measured depth are hidden, 0 to 1.
     pub hide: f32,
+    /// Every sample has the lens of its camera model; else each one is a little off it.
+    pub nominal_lens: bool,
+    /// Number of the measurement: each draws sensor and noise anew, of the same worlds, views and colour images.
+    pub again: u64,
     /// Families of objects.
     pub families: Vec<Family>,
     /// Meshes for [`Family::Mesh`].
@@ -89,6 +95,8 @@ impl Default for Settings {
             cameras: vec!["d435".to_owned()],
             sensor: Sensor::Statistical,
             hide: 0.0,
+            nominal_lens: false,
+            again: 0,
             families: Family::ALL.into_iter().filter(|f| *f != Family::Mesh).collect(),
             meshes: Vec::new(),
         }
@@ -185,22 +193,28 @@ impl Generator {
         &self.settings
     }
 
+    fn model(&self, number: u64) -> &'static Model {
+        self.models[(number % self.models.len() as u64) as usize]
+    }
+
     /// Sample `number`.
     ///
     /// # Errors
     /// [`ErrorKind::BadInput`] when a view cannot be registered.
     pub fn sample(&self, number: u64) -> Result<Triplet> {
         let Settings { seed, width, height, sensor, .. } = self.settings;
-        let model = self.models[(number % self.models.len() as u64) as usize];
-        let model = &varied(model, &mut Draw::new(seed, number, 5));
+        let model = self.model(number);
+        let measured = if self.settings.again == 0 { seed } else { mix(seed ^ mix(self.settings.again)) };
+        let model = &varied(model, &mut Draw::new(measured, number, 5));
         let RandomWorld { world, kind, families, camera_pose } = RandomWorld::new(seed, number, &self.stock);
-        let optics = Optics::new(model, seed, number, (width, height));
-        let noise = mix(seed ^ mix(number.wrapping_add(0x5CE4E)));
+        let optics = self.optics(model, number);
+        let noise_of = |seed: u64| mix(seed ^ mix(number.wrapping_add(0x5CE4E)));
+        let noise = noise_of(measured);
 
         let rays = Rays::new(&optics.color, width, height);
         let view = View::new(&rays, &(camera_pose * model.color_in_device.to_affine()));
         let mets = view.cast(&world);
-        let mut color = color::render_met(&world, &view, &mets, model.white, noise);
+        let mut color = color::render_met(&world, &view, &mets, model.white, noise_of(seed));
         optics::blemish(&mut Draw::new(seed, number, 3), &mut color, width as usize);
         let truth = mets.iter().map(|m| if *m == NOTHING { 0 } else { depth::counts(m.t, TRUTH_UNIT_M) });
         let material = mets.iter().map(|m| material_of(&world, m.key)).collect();
@@ -246,6 +260,11 @@ impl Generator {
             intrinsics: optics.color,
         })
     }
+
+    fn optics(&self, model: &Model, number: u64) -> Optics {
+        let Settings { seed, width, height, nominal_lens, .. } = self.settings;
+        Optics::new(model, if nominal_lens { 0.0 } else { 1.0 }, seed, number, (width, height))
+    }
 }
 
 /// The same model with more or less noise; a projector fails now and then, as in the sun.
@@ -281,7 +300,7 @@ fn register(optics: &Optics, model: &Model, size: (u32, u32), sensed: &[u16]) ->
     Ok(raw)
 }
 
-/// A sample's lenses: those of the model, a little off.
+/// A sample's lenses: those of the model, `off` times a little off.
 #[derive(Debug)]
 struct Optics {
     color: Intrinsics,
@@ -290,9 +309,9 @@ struct Optics {
 }
 
 impl Optics {
-    fn new(model: &Model, seed: u64, number: u64, size: (u32, u32)) -> Self {
+    fn new(model: &Model, off: f64, seed: u64, number: u64, size: (u32, u32)) -> Self {
         let rolls = super::noise::Rolls::new(seed, number as u32, (number >> 32) as u32, 2);
-        let off = |i: u64, by: f64| (rolls.unit_f64(i) * 2.0 - 1.0) * by;
+        let off = |i: u64, by: f64| (rolls.unit_f64(i) * 2.0 - 1.0) * by * off;
         let color_mode = fitted(model.color_modes, size);
         // Depth of about the same height as colour.
         let depth_modes = model.depth_modes.iter().filter(|m| m.height >= size.1);
@@ -330,11 +349,10 @@ fn fitted(modes: &[Mode], (width, height): (u32, u32)) -> Mode {
 }
 
 fn material_of(world: &World, key: u16) -> u8 {
-    let paint = if key == NOTHING.key {
-        return 0;
-    } else {
-        world.paint(key)
-    };
+    if key == NOTHING.key { 0 } else { material_of_paint(world.paint(key)) }
+}
+
+fn material_of_paint(paint: Paint) -> u8 {
     match paint.surface() {
         Surface::Glass => 4,
         Surface::Shiny | Surface::Mirror => 3,

@@ -4,10 +4,12 @@
 use glam::{Mat3, Vec3};
 use std::sync::Arc;
 
+mod dice;
 mod lathe;
 mod mesh;
 mod superquadric;
 
+pub(crate) use dice::Triangles;
 pub(crate) use lathe::Lathe;
 pub(crate) use mesh::Mesh;
 pub(crate) use superquadric::Superquadric;

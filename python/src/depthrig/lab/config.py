@@ -36,9 +36,9 @@ class ModelConfig:
     kind: str = "tiny"
     """`tiny`, `cdm` (the official form), `hole` or `value` (noise models of a camera)."""
     encoder: str = "vits"
-    """Encoder of `cdm`, `hole` and `value`: `vits`, `vitb` or `vitl`."""
-    width: int = 32
-    """Channels of the first stage of `tiny`."""
+    """Encoder of `cdm`, `hole` and `value`: `vits`, `vitb` or `vitl`. `conv`, of `hole` and `value` alone, is a U-Net."""
+    width: int = 48
+    """Channels of the first stage of `tiny` and of `conv`."""
     weights: str | None = None
     """State to begin with: a file of `torch.save(net.state_dict())`. Names that it lacks stay as they are drawn."""
     refined_input: bool = False
@@ -46,7 +46,9 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         _one_of("kind", self.kind, ("tiny", "cdm", "hole", "value"))
-        _one_of("encoder", self.encoder, ("vits", "vitb", "vitl"))
+        _one_of("encoder", self.encoder, ("vits", "vitb", "vitl", "conv"))
+        if self.encoder == "conv" and self.kind == "cdm":
+            raise LabError('encoder = "conv" is one of noise models; kind = "cdm" needs vits, vitb or vitl')
         _within("width", self.width, 8, 256)
         if self.width % 8:
             raise LabError(f"width = {self.width} is not a multiple of 8")
@@ -87,6 +89,8 @@ class SynthesisConfig:
     """`make_shards`: state of the camera's value model, of `model.encoder`."""
     hole: str | None = None
     """The same of its hole model."""
+    filter: bool = True
+    """Whether value noise is filtered along the truth (the guided filter), but for a tenth of the images."""
     strength: float = 1.0
     """Factor of every high-frequency noise; 0 is none."""
 
@@ -101,16 +105,20 @@ class LossConfig:
     """The loss."""
 
     space: str = "inverse"
-    """Errors are of `inverse` depth, 1/m, or of its logarithm (`log`), in which near and far count alike."""
+    """Errors are of `inverse` depth, 1/m, of its logarithm (`log`), in which near and far count alike, or of depth as a
+    part of filled depth's error in that image (`fill`; `tiny` alone, without the two weights below)."""
     gradient: float = 0.5
     """Weight of the difference of gradients; the paper prints 1, PromptDA has 0.5."""
     missing: float = 1.0
     """Weight of a pixel whose raw depth is missing or wrong by more than 5 %, relative to one that was measured."""
+    worse: float = 1.0
+    """`fill`: weight of how much worse an image became."""
     near_m: float = 0.1
     far_m: float = 6.0
 
     def __post_init__(self) -> None:
-        _one_of("space", self.space, ("inverse", "log"))
+        _one_of("space", self.space, ("inverse", "log", "fill"))
+        _within("worse", self.worse, 0, 100)
         _within("gradient", self.gradient, 0, 100)
         _within("missing", self.missing, 0.01, 100)
         _within("near_m", self.near_m, 0.01, 100)
@@ -125,7 +133,7 @@ class TrainConfig:
     batch: int = 8
     """Samples of one step in one process."""
     crop: tuple[int, int] = (192, 256)
-    """Height and width of the crop; multiples of 16 for `tiny`, of 14 for the others."""
+    """Height and width of the crop; multiples of 16 for `tiny`, any for `conv`, of 14 for the others."""
     flip: bool = False
     """Mirrored images half of the time. Refused for stereo: what is hidden lies left of things."""
     color_jitter: float = 0.2
@@ -191,11 +199,14 @@ class Config:
         if not self.data:
             raise LabError("there is no [[data]]; name at least one dataset")
         _within("seed", self.seed, 0, 2**63 - 1)
-        multiple = 16 if self.model.kind == "tiny" else 14
+        of_vit = 1 if self.model.encoder == "conv" else 14
+        multiple = 16 if self.model.kind == "tiny" else of_vit
         if any(side % multiple for side in self.train.crop):
             raise LabError(
                 f"crop = {list(self.train.crop)} are not multiples of {multiple}, as {self.model.kind} needs"
             )
+        if self.train.loss.space == "fill" and self.model.kind != "tiny":
+            raise LabError(f'loss.space = "fill" is for tiny alone; use "inverse" or "log" for {self.model.kind}')
         if self.train.flip and self.synthesis.sensor != "tof":
             raise LabError('flip = true needs sensor = "tof": a stereo camera misses what lies left of things')
 

@@ -277,7 +277,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns 0, 1 with a message, or 3 when a gate is not reached."""
     parser = argparse.ArgumentParser(prog="python -m depthrig.lab.gates", description="Measure tiny against fill")
     parser.add_argument("model", type=Path, metavar="MODEL.pt")
-    parser.add_argument("--width", type=int, default=32, metavar="N", help="of the network [default: 32]")
+    parser.add_argument("--width", type=int, default=48, metavar="N", help="of the network [default: 48]")
     parser.add_argument("--held-out", type=Path, required=True, metavar="DIR", help="shards that training never saw")
     parser.add_argument("--real", type=Path, required=True, metavar="DIR", help="folder of real images")
     parser.add_argument("--depthrig", type=Path, required=True, metavar="FILE", help="the program, for fill")

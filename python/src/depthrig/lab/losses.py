@@ -8,15 +8,39 @@ from torch import Tensor
 
 from .config import LossConfig
 
-__all__ = ["hole_loss", "refine_loss", "value_loss"]
+__all__ = ["beside_fill_loss", "hole_loss", "refine_loss", "value_loss"]
 
 WRONG = 0.05
 """Raw depth that is off by more than this share of the truth counts as missing."""
+
+FILL_OFF_M, WORSE_OFF_M = 0.1, 0.01
+"""Added to the L1 of filled depth over an image where it is a denominator."""
 
 
 def inverse(depth: Tensor) -> Tensor:
     """Return 1/m of metres; 0 stays 0."""
     return torch.where(depth > 0, 1 / depth.clamp_min(1e-6), 0.0)
+
+
+def beside_fill_loss(predicted: Tensor, truth: Tensor, filled: Tensor, config: LossConfig) -> Tensor:
+    """Return the mean over images of what the L1 of depth changes in that of filled depth, as a part of it.
+
+    `FILL_OFF_M` is added to that part's denominator, so that images with much to win count most. An image that became
+    worse counts again, `config.worse` times, as a part of its own error.
+
+    :param predicted: `(batch, height, width)`, 1/m, as `filled`.
+    :param truth: metres, 0 where unknown.
+    """
+    valid = (truth >= config.near_m) & (truth <= config.far_m) & (filled > 0)
+    count = valid.sum((1, 2)).clamp_min(1)
+
+    def error(of: Tensor) -> Tensor:
+        return (torch.where(valid, 1 / of.clamp_min(1e-3) - truth, 0.0).abs().sum((1, 2))) / count
+
+    before = error(filled)
+    change = error(predicted) - before
+    worse = change.clamp_min(0) / (before + WORSE_OFF_M)
+    return (change / (before + FILL_OFF_M) + config.worse * worse).mean()
 
 
 def refine_loss(predicted: Tensor, truth: Tensor, raw: Tensor, config: LossConfig) -> Tensor:

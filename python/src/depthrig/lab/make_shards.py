@@ -21,9 +21,9 @@ from .config import Config, read
 from .data import Source, open_source
 from .errors import LabError
 from .losses import inverse
-from .nets import NoiseNet, load_weights
+from .nets import NoiseConv, NoiseNet, load_weights, noise_net
 from .nets.cdm import normalise_color
-from .nets.vit import PATCH, SIZES
+from .nets.vit import PATCH
 from .sample import Sample, check_licences
 from .shards import ShardWriter, part_of, write_description
 from .synthesis import synthesise
@@ -31,7 +31,7 @@ from .synthesis import synthesise
 __all__ = ["main", "make"]
 
 SIDE = 392
-"""Shorter side of an image for the noise models, pixels."""
+"""Shorter side of an image for the noise models with a ViT, pixels. `conv` gets images as they are."""
 
 
 class NoiseModels:
@@ -43,10 +43,10 @@ class NoiseModels:
         self.hole = self._open(config, config.synthesis.hole)
 
     @staticmethod
-    def _open(config: Config, path: str | None) -> NoiseNet | None:
+    def _open(config: Config, path: str | None) -> NoiseConv | NoiseNet | None:
         if path is None:
             return None
-        net = NoiseNet(SIZES[config.model.encoder], 4 if config.model.refined_input else 3)
+        net = noise_net(config.model)
         if missing := load_weights(net, Path(path)):
             raise LabError(f"{path}: no tensor {missing[0]}; it is of another network")
         return net.eval()
@@ -57,8 +57,10 @@ class NoiseModels:
         if self.value is None and self.hole is None:
             return None, None
         height, width = color.shape[:2]
-        scale = SIDE / min(height, width)
-        size = [max(1, round(scale * side / PATCH)) * PATCH for side in (height, width)]
+        size = [height, width]
+        if not isinstance(self.value or self.hole, NoiseConv):
+            scale = SIDE / min(height, width)
+            size = [max(1, round(scale * side / PATCH)) * PATCH for side in size]
         x = torch.from_numpy(color.transpose(2, 0, 1).astype(np.float32))[None] / 255
         x = normalise_color(F.interpolate(x, size=size, mode="bilinear", align_corners=False, antialias=True))
 
@@ -66,7 +68,7 @@ class NoiseModels:
             truth = inverse(torch.from_numpy(sample.need_truth()))[None, None]
             x = torch.cat([x, F.interpolate(truth, size=size, mode="nearest")], 1)
 
-        def full(net: NoiseNet) -> torch.Tensor:
+        def full(net: NoiseConv | NoiseNet) -> torch.Tensor:
             with torch.inference_mode():
                 small = net(x)[:, None]
             return F.interpolate(small, size=(height, width), mode="bilinear", align_corners=False)[0, 0]

@@ -2,12 +2,14 @@
 
 With the package `ray` the parts run on its cluster, one CPU each; with `--local JOBS` they run here. A command must
 be free of state: run again, it leaves what is complete and makes the rest. A part whose command fails, or whose
-worker dies, is run again.
+worker dies, is run again; a command ends with its worker, so that the next one finds no other at its work.
 """
 
 from __future__ import annotations
 
 import argparse
+import ctypes
+import signal
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -19,14 +21,21 @@ from .errors import LabError
 __all__ = ["main", "run_local", "run_ray"]
 
 RETRIES = 2
+_PR_SET_PDEATHSIG = 1  # prctl(2)
+_prctl = ctypes.CDLL(None).prctl
 
 
 class PartFailedError(Exception):
     """A command that ended with another code than 0."""
 
 
+def _end_with_worker() -> None:
+    _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
 def _part(command: Sequence[str], k: int, n: int) -> None:
-    done = subprocess.run([*command, "--shard", f"{k}/{n}"], capture_output=True, text=True, check=False)
+    part = [*command, "--shard", f"{k}/{n}"]
+    done = subprocess.run(part, capture_output=True, text=True, check=False, preexec_fn=_end_with_worker)
     if done.returncode != 0:
         lines = done.stderr.strip().splitlines()
         raise PartFailedError(f"--shard {k}/{n} ended with {done.returncode}: {lines[-1] if lines else 'no message'}")

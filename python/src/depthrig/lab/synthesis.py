@@ -48,12 +48,18 @@ def smooth_field(rng: np.random.Generator, shape: tuple[int, int], radius: int, 
 
 
 def value_noise(
-    truth: npt.NDArray[np.float32], relative: npt.NDArray[Any] | None, stereo: bool, rng: np.random.Generator
+    truth: npt.NDArray[np.float32],
+    relative: npt.NDArray[Any] | None,
+    stereo: bool,
+    rng: np.random.Generator,
+    filtered: bool = True,
 ) -> npt.NDArray[np.float32]:
     """Return the truth with the noise of a value model's relative depth: metres, 0 where there are none.
 
     The filter's radius is drawn from 2 to 64 pixels (at a width of 640) and its epsilon from 1e-5 to 1e-2 of the
     variance, both log-uniform.
+
+    :param filtered: False leaves the filter out.
     """
     kind = rng.random()
     radius = np.exp(rng.uniform(np.log(2), np.log(64))) * truth.shape[1] / AT_WIDTH
@@ -63,7 +69,7 @@ def value_noise(
     if relative.shape != truth.shape:
         raise LabError(f"value noise of {relative.shape} for a truth of {truth.shape}")
     noisy = unscale(relative, truth, inverse=stereo, side=ANCHORS_SIDE)
-    if kind < TRUE + UNFILTERED:
+    if kind < TRUE + UNFILTERED or not filtered:
         return noisy
     valid = (truth > 0) & (noisy > 0)
     if not valid.any():
@@ -215,7 +221,7 @@ def synthesise(
     """
     if config.sensor == "none":
         raise LabError('synthesis needs sensor = "stereo" or "tof"')
-    raw = value_noise(truth, relative, config.sensor == "stereo", rng)
+    raw = value_noise(truth, relative, config.sensor == "stereo", rng, config.filter)
     raw = with_noise(raw, draw_noise(rng, config.strength), config, rng)
     if hole_probability is not None:
         raw = np.where(hole_mask(hole_probability, rng), np.float32(0), raw)

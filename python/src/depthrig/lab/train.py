@@ -72,6 +72,8 @@ def loss_of(predicted: Tensor, batch: dict[str, Any], config: Config) -> Tensor:
         return losses.hole_loss(predicted, batch["raw"], batch["seen"])
     if config.model.kind == "value":
         return losses.value_loss(predicted, batch["raw"], stereo=config.synthesis.sensor != "tof")
+    if config.train.loss.space == "fill":
+        return losses.beside_fill_loss(predicted, batch["truth"], batch["filled"], config.train.loss)
     return losses.refine_loss(predicted, batch["truth"], batch["raw"], config.train.loss)
 
 

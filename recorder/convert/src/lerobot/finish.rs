@@ -200,7 +200,12 @@ fn calibrations(plan: &Plan, sources: &[Source]) -> Value {
             }
             Some(entry)
         });
-        json!({ "episode_index": index, "session": session.name, "streams": streams.collect::<Vec<_>>() })
+        let mut entry =
+            json!({ "episode_index": index, "session": session.name, "streams": streams.collect::<Vec<_>>() });
+        if let Some(episode) = source.episode() {
+            entry["episode"] = json!(episode);
+        }
+        entry
     });
     json!({ "format": "depthrig.lerobot_calibration/1", "episodes": episodes.collect::<Vec<_>>() })
 }

@@ -20,13 +20,15 @@ pub(super) struct Plan {
     pub(super) losses: Vec<String>,
 }
 
-/// A dataset as an episode.
+/// A dataset, or one of its episodes, as an episode of LeRobot.
 #[derive(Debug, Clone)]
 pub(super) struct Episode {
     pub(super) task: usize,
     pub(super) first_row: u64,
     pub(super) rows: u64,
-    /// Numbers of the sets that are left out, in order.
+    /// Number of its first set.
+    first: usize,
+    /// Numbers of its sets that are left out, in order.
     left_out: Vec<usize>,
 }
 
@@ -35,7 +37,7 @@ impl Episode {
     pub(super) fn row_of(&self, number: usize) -> Option<u64> {
         match self.left_out.binary_search(&number) {
             Ok(_) => None,
-            Err(before) => Some((number - before) as u64),
+            Err(before) => Some((number - self.first - before) as u64),
         }
     }
 }
@@ -46,11 +48,10 @@ const STEP_NS: i64 = 100_000;
 /// How often two rows that follow each other were this far apart, in steps of [`STEP_NS`].
 type Steps = BTreeMap<i64, u64>;
 
-fn steps(times: &[i64], episode: &Episode) -> Steps {
+fn steps(times: impl Iterator<Item = i64>) -> Steps {
     let mut steps = Steps::new();
-    let kept = times.iter().enumerate().filter(|(n, _)| episode.row_of(*n).is_some()).map(|(_, t)| *t);
     let mut last = None;
-    for t in kept {
+    for t in times {
         if let Some(last) = last.replace(t) {
             *steps.entry((t - last) / STEP_NS).or_default() += 1;
         }
@@ -91,7 +92,7 @@ fn incomplete(source: &Source, schema: &Schema) -> Result<Vec<usize>> {
     let place = schema.places(source);
     let mut reader = source.reader();
     let mut found = Vec::new();
-    for number in 0..source.times().len() {
+    for number in source.numbers() {
         match reader.read(number, PixelMode::None) {
             Err(e) if e.kind() == ErrorKind::Io => return Err(e),
             Ok(set) if !set.missing.iter().any(|s| place.get(*s).copied().flatten().is_some()) => {}
@@ -122,7 +123,7 @@ impl Plan {
                 Incomplete::Mark => Vec::new(),
                 Incomplete::LeaveOut => incomplete(source, &plan.schema)?,
             };
-            let rows = (source.times().len() - left_out.len()) as u64;
+            let rows = (source.numbers().count() - left_out.len()) as u64;
             if rows == 0 {
                 return Err(bad(format!("{name}: there is no set to export in it")));
             }
@@ -131,9 +132,13 @@ impl Plan {
                 plan.tasks.push(task);
                 plan.tasks.len() - 1
             });
-            let episode = Episode { task, first_row, rows, left_out };
-            let steps = steps(source.times(), &episode);
-            let here = options.fps.or_else(|| rate(source, &steps)).unwrap_or(1.0);
+            let first = source.numbers().next().unwrap_or_default();
+            let episode = Episode { task, first_row, rows, first, left_out };
+            let times = source.times();
+            let kept = steps(source.numbers().filter(|n| episode.row_of(*n).is_some()).map(|n| times[n]));
+            // An episode may have too few sets to know a rate from.
+            let of_rate = if source.episode().is_some() { &steps(times.iter().copied()) } else { &kept };
+            let here = options.fps.or_else(|| rate(source, of_rate)).unwrap_or(1.0);
             let fps = *fps.get_or_insert(here);
             if (here / fps - 1.0).abs() > 1e-3 {
                 return Err(bad(format!(
@@ -141,12 +146,13 @@ impl Plan {
                      episodes; export them separately or give the rate"
                 )));
             }
-            let session = &source.session().name;
+            let number = source.episode().map(|e| format!(" episode {}", e.number)).unwrap_or_default();
+            let session = format!("{}{number}", source.session().name);
             if !episode.left_out.is_empty() {
                 let n = episode.left_out.len();
                 plan.losses.push(format!("{session}: {n} sets that lack a frame are left out"));
             }
-            let (gaps, missing) = gaps(&steps, fps);
+            let (gaps, missing) = gaps(&kept, fps);
             if gaps > 0 {
                 plan.losses.push(format!(
                     "{session}: {gaps} gaps in time ({missing} sets) are closed by the even grid of timestamp; \
@@ -166,8 +172,11 @@ impl Plan {
     }
 }
 
-/// LeRobot's task is a sentence; the scene is the nearest that a session has.
+/// LeRobot's task is a sentence: that of the episode; else the scene is the nearest that a session has.
 fn task_of(source: &Source) -> String {
+    if let Some(task) = source.episode().map(|e| e.task.trim()).filter(|t| !t.is_empty()) {
+        return task.to_owned();
+    }
     let session = source.session();
     let scene = session.scene.trim();
     if scene.is_empty() { session.name.clone() } else { scene.to_owned() }

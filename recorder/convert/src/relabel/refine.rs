@@ -1,7 +1,7 @@
 //! Refines every image of a dataset into files, a few sets in each: a killed run goes on with them.
 
 use super::{Camera, Engine, RelabelOptions, cannot};
-use crate::{Exporter, Output, Part, PartOut, PartSets, Parts, Plan, Source};
+use crate::{EpisodeUse, Exporter, Output, Part, PartOut, PartSets, Parts, Plan, Source};
 use depthrig_bus::sync::lock;
 use depthrig_bus::{FrameHeader, files};
 use depthrig_cdm::stage::Refiners;
@@ -26,6 +26,33 @@ pub(super) struct Refine<'a> {
     pub(super) options: &'a RelabelOptions,
 }
 
+// Counters of the refined images, for each camera.
+/// Sets that lack colour or depth.
+pub(super) const UNPAIRED: &str = "sets without colour or depth";
+/// Pixels without depth before.
+pub(super) const HOLES_BEFORE: &str = "holes before";
+/// Pixels without depth after.
+pub(super) const HOLES: &str = "holes";
+/// Pixels.
+pub(super) const PIXELS: &str = "pixels";
+
+/// The name of a camera's counter.
+pub(super) fn counter(camera: &Camera, what: &str) -> String {
+    format!("{}: {what}", camera.id)
+}
+
+/// Pixels without depth.
+fn holes<'a>(depth: impl Iterator<Item = &'a u16>) -> u64 {
+    depth.filter(|z| **z == 0).count() as u64
+}
+
+/// A refined image.
+struct RefinedDepth {
+    depth: Vec<u16>,
+    /// Pixels of its input without depth.
+    holes_before: u64,
+}
+
 /// The file of the part that begins with this set.
 fn file_name(first: usize) -> String {
     format!("sets_{first:08}.refined")
@@ -34,6 +61,11 @@ fn file_name(first: usize) -> String {
 impl Exporter for Refine<'_> {
     fn format(&self) -> &'static str {
         "refined depth"
+    }
+
+    /// The copy has the episodes, too.
+    fn episodes(&self) -> EpisodeUse {
+        EpisodeUse::All
     }
 
     fn options(&self) -> Value {
@@ -59,12 +91,19 @@ impl Exporter for Refine<'_> {
         let mut packed = Vec::new();
         while let Some((number, set)) = sets.next(PixelMode::Decoded, out)? {
             for (at, camera) in self.cameras.iter().enumerate() {
-                let Some((color, depth)) = pair(&set, camera) else { continue };
+                let Some((color, depth)) = pair(&set, camera) else {
+                    out.count(&counter(camera, UNPAIRED), 1);
+                    continue;
+                };
                 let refined = self.refine(camera, color, depth, &mut views[at])?;
+                out.count(&counter(camera, HOLES_BEFORE), refined.holes_before);
+                out.count(&counter(camera, HOLES), holes(refined.depth.iter()));
+                out.count(&counter(camera, PIXELS), refined.depth.len() as u64);
+                let bytes: Vec<u8> = refined.depth.iter().flat_map(|v| v.to_le_bytes()).collect();
                 let h = &color.header;
                 let shape = DepthShape { width: h.width, height: h.height, step: h.width * 2 };
                 packed.clear();
-                encoder.encode(&refined, shape, &mut packed)?;
+                encoder.encode(&bytes, shape, &mut packed)?;
                 file.extend_from_slice(&(number as u64).to_le_bytes());
                 file.extend_from_slice(&(at as u32).to_le_bytes());
                 file.extend_from_slice(&(packed.len() as u32).to_le_bytes());
@@ -96,14 +135,14 @@ pub(super) fn unit_of(depth: &FrameHeader) -> f64 {
 }
 
 impl Refine<'_> {
-    /// Refined depth of one pair, little-endian 16-bit numbers.
+    /// Refined depth of one pair.
     fn refine(
         &self,
         camera: &Camera,
         color: &DatasetFrame,
         depth: &DatasetFrame,
         view: &mut View,
-    ) -> Result<Vec<u8>> {
+    ) -> Result<RefinedDepth> {
         let bad = |why: String| {
             let id = &camera.id;
             Error::new(
@@ -113,6 +152,7 @@ impl Refine<'_> {
         };
         let (registered, unit_m) =
             view.depth(&self.options.refine, &color.header, &depth.header, &depth.pixels).map_err(bad)?;
+        let holes_before = holes(registered.iter());
         let image = pixels::color(&color.header, &color.pixels).map_err(|e| bad(e.to_string()))?;
         let mut out = vec![0; image.width * image.height];
         let engine = &self.engines[camera.engine];
@@ -125,7 +165,7 @@ impl Refine<'_> {
         }];
         refiner.refine(&mut job).map_err(|e| bad(e.to_string()))?;
         lock(&engine.free).push(refiner);
-        Ok(out.iter().flat_map(|v| v.to_le_bytes()).collect())
+        Ok(RefinedDepth { depth: out, holes_before })
     }
 
     /// A refiner that nobody uses.

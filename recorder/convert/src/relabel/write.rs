@@ -1,7 +1,7 @@
 //! The copy: the sets of the source, each with its refined depth.
 
 use super::refine::{Store, pair, unit_of};
-use super::{Camera, Engine};
+use super::{Camera, Engine, Form};
 use crate::{ImportFacts, ImportProgress, Importer};
 use depthrig_bus::{DropCounts, PixelFormat, StageStep, UtcPair};
 use depthrig_cdm::stage::derived_header;
@@ -22,7 +22,10 @@ pub(super) struct Write<'a> {
     engines: &'a [Engine],
     /// Streams of the source.
     streams: usize,
+    form: Form,
     written: Vec<u64>,
+    /// Number of the last frame of each camera.
+    numbers: Vec<u64>,
     epochs: Vec<Option<u32>>,
     facts: ImportFacts,
 }
@@ -50,6 +53,7 @@ impl<'a> Write<'a> {
         refined: &Path,
         cameras: &'a [Camera],
         engines: &'a [Engine],
+        form: Form,
     ) -> Result<Self> {
         let reader = dataset.set_reader()?;
         let source = dataset.session();
@@ -72,11 +76,17 @@ impl<'a> Write<'a> {
             });
         }
         let name = |p: &Path| p.file_name().unwrap_or(p.as_os_str()).to_string_lossy().into_owned();
+        let mut from = vec![name(dataset.path())];
+        from.extend(dataset.segments().iter().filter(|_| form == Form::Piece).map(|s| name(s)));
         session.derived.push(Derived {
             by: "relabel".to_owned(),
-            utc_ns: UtcPair::sample().utc_ns,
+            utc_ns: match form {
+                Form::Whole => UtcPair::sample().utc_ns,
+                // The same bytes whoever makes it, whenever.
+                Form::Piece => reader.times().last().copied().unwrap_or_default(),
+            },
             depthrig_version: env!("CARGO_PKG_VERSION").to_owned(),
-            from: vec![name(dataset.path())],
+            from,
             first_utc_ns: reader.times().first().copied().unwrap_or_default(),
             last_utc_ns: reader.times().last().copied().unwrap_or_default(),
             offered_before: 0,
@@ -92,7 +102,9 @@ impl<'a> Write<'a> {
             cameras,
             engines,
             streams: source.streams.len(),
+            form,
             written: vec![0; cameras.len()],
+            numbers: vec![0; cameras.len()],
             epochs: vec![None; cameras.len()],
             facts,
         })
@@ -126,7 +138,12 @@ impl<'a> Write<'a> {
         header.set_names(&self.session.rig, &camera.id);
         header.set_refiner(&description.engine, &description.model);
         self.written[at] += 1;
-        (header.sequence, header.captured) = (self.written[at], self.written[at]);
+        self.numbers[at] = match self.form {
+            Form::Whole => self.written[at],
+            // Nobody has counted the frames of the pieces before; ids rise from piece to piece.
+            Form::Piece => set.id,
+        };
+        (header.sequence, header.captured) = (self.numbers[at], self.numbers[at]);
         header.dropped = DropCounts::default().0;
         Ok(Some(RecordFrame { stream: self.streams + at, header, pixels: Box::new(pixels) }))
     }
@@ -188,7 +205,7 @@ impl Importer for Write<'_> {
 
     fn facts(&self) -> ImportFacts {
         let mut facts = self.facts.clone();
-        let new = self.cameras.iter().zip(&self.written).map(|(camera, n)| StreamAccount {
+        let new = self.cameras.iter().zip(&self.numbers).map(|(camera, n)| StreamAccount {
             stream: camera.id.clone(),
             captured: *n,
             delivered: *n,

@@ -1,6 +1,6 @@
 //! A sample's members, and samples beside each other as one image.
 
-use depthrig_bus::Distortion;
+use depthrig_bus::{Distortion, Intrinsics};
 use depthrig_cdm::{Color, ColorFormat, FillRefiner, Job, Output, RawDepth, Refiner, StepTimes};
 use depthrig_recorder::{Error, ErrorKind, Result};
 use depthrig_sim::synthetic::scenes::{Settings, TRUTH_UNIT_M, Triplet};
@@ -29,13 +29,19 @@ struct Record<'a> {
 }
 
 #[derive(Serialize)]
-struct Lens {
+pub(super) struct Lens {
     fx: f64,
     fy: f64,
     cx: f64,
     cy: f64,
     model: Distortion,
     coeffs: [f64; 8],
+}
+
+impl Lens {
+    pub(super) fn of(k: &Intrinsics) -> Self {
+        Self { fx: k.fx, fy: k.fy, cx: k.cx, cy: k.cy, model: k.distortion(), coeffs: k.coeffs }
+    }
 }
 
 /// Makes the refiner `fill` of the daemon, for the holes of measured depth, so that a network learns on what it gets
@@ -67,7 +73,6 @@ pub(super) fn members(s: &Triplet, settings: &Settings, fill: &mut FillRefiner) 
     let size = (settings.width, settings.height);
     let key = format!("{:010}", s.number);
     let gray16 = |v: &[u16]| png(bytemuck::cast_slice(v), size, ExtendedColorType::L16);
-    let k = &s.intrinsics;
     let record = Record {
         format: super::FORMAT,
         sensor: s.camera,
@@ -75,7 +80,7 @@ pub(super) fn members(s: &Triplet, settings: &Settings, fill: &mut FillRefiner) 
         seed: settings.seed,
         families: s.families.iter().map(|f| f.name()).collect(),
         scene: s.scene.name(),
-        intrinsics: Lens { fx: k.fx, fy: k.fy, cx: k.cx, cy: k.cy, model: k.distortion(), coeffs: k.coeffs },
+        intrinsics: Lens::of(&s.intrinsics),
         truth_unit_m: TRUTH_UNIT_M,
         raw_unit_m: s.raw_unit_m,
         hidden: s.hidden,
@@ -95,7 +100,7 @@ pub(super) fn members(s: &Triplet, settings: &Settings, fill: &mut FillRefiner) 
     ])
 }
 
-fn png(pixels: &[u8], (width, height): (u32, u32), kind: ExtendedColorType) -> Result<Vec<u8>> {
+pub(super) fn png(pixels: &[u8], (width, height): (u32, u32), kind: ExtendedColorType) -> Result<Vec<u8>> {
     let mut out = Vec::new();
     let filter = if kind == ExtendedColorType::L8 { FilterType::Up } else { FilterType::Paeth };
     PngEncoder::new_with_quality(&mut out, CompressionType::Fast, filter)

@@ -1,4 +1,7 @@
 //! The part of tar (POSIX.1-1988 ustar) that shards need: plain files with short names.
+//!
+//! Not the crate `tar` (0.4.44), here and in `depthrig eval`: it takes an archive for complete that was cut between two members
+//! or in its end, and pads a header's checksum in another way, while the bytes of shards are promised to stay.
 
 use std::io::{self, Read, Seek, SeekFrom, Write};
 use std::path::Path;

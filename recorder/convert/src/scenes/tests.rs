@@ -7,7 +7,15 @@ fn generator() -> Generator {
 }
 
 fn plan(folder: &Path) -> Plan {
-    Plan { folder: folder.to_owned(), name: "t".into(), count: 7, per_shard: 3, part: (0, 1), threads: 2 }
+    Plan {
+        folder: folder.to_owned(),
+        remote: None,
+        name: "t".into(),
+        count: 7,
+        per_shard: 3,
+        part: RunPart::ALL,
+        threads: 2,
+    }
 }
 
 fn go(plan: &Plan) -> Report {
@@ -97,7 +105,7 @@ fn parts_made_anywhere_are_the_bytes_of_the_run() {
     let two = tempfile::tempdir().unwrap();
     go(&plan(one.path()));
     for k in [1, 0] {
-        go(&Plan { part: (k, 2), threads: 1, ..plan(two.path()) });
+        go(&Plan { part: [k, 2].try_into().unwrap(), threads: 1, ..plan(two.path()) });
     }
     assert_eq!(files(one.path()), files(two.path()));
 }
@@ -152,13 +160,40 @@ fn another_run_another_process_and_impossible_plans_are_refused() {
     part.lock().unwrap();
     let e = refused(&plan(dir.path()));
     assert_eq!(e.kind(), ErrorKind::InUse, "{e}");
-    for bad in [
-        Plan { name: "../t".into(), ..plan(dir.path()) },
-        Plan { per_shard: 0, ..plan(dir.path()) },
-        Plan { part: (2, 2), ..plan(dir.path()) },
-    ] {
+    for bad in [Plan { name: "../t".into(), ..plan(dir.path()) }, Plan { per_shard: 0, ..plan(dir.path()) }] {
         assert_eq!(refused(&bad).kind(), ErrorKind::BadInput);
     }
+}
+
+#[test]
+fn a_part_that_became_a_shard_is_not_the_part_any_more() {
+    let dir = tempfile::tempdir().unwrap();
+    let shard = dir.path().join("t-000000.tar");
+    let part = Part::create(&shard).unwrap();
+    let name = part.path.clone().unwrap();
+    let opened = File::open(&name).unwrap();
+    assert!(is_named(&opened, &name));
+    part.rename(&shard).unwrap();
+    assert!(!is_named(&opened, &name), "it has another name");
+    std::fs::write(&name, "of another process").unwrap();
+    assert!(!is_named(&opened, &name) && is_named(&opened, &shard));
+}
+
+#[test]
+fn a_shard_that_was_made_meanwhile_is_left_alone() {
+    let dir = tempfile::tempdir().unwrap();
+    let p = plan(dir.path());
+    let mut is_first = true;
+    let report = write(&generator(), &p, &mut |_, _| {
+        // Another process makes all of them between the list of what is missing and the first shard.
+        if std::mem::take(&mut is_first) {
+            go(&p);
+        }
+        true
+    });
+    let report = report.unwrap();
+    assert_eq!((report.shards_found, report.samples, report.shards_missing), (3, 0, 0));
+    assert_eq!(files(dir.path()).len(), 4, "three shards and their arguments");
 }
 
 #[test]
@@ -217,4 +252,52 @@ fn hidden_regions_are_holes_before_they_are_filled_and_the_record_has_their_shar
     }
     assert!((15..=33).contains(&hidden), "{hidden} of 40");
     assert!(Generator::new(settings(1.5)).unwrap_err().to_string().contains("0..=1"));
+}
+
+#[test]
+fn a_dataset_has_a_world_each_set_and_one_lens() {
+    use depthrig_recorder::fs::RealFs;
+    use depthrig_recorder::{ColorCodec, Dataset, RecorderOptions, SetRange};
+    use std::ops::ControlFlow;
+    use std::sync::Arc;
+
+    let settings = Settings { nominal_lens: true, ..generator().settings().clone() };
+    let made = Generator::new(settings.clone()).unwrap();
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("random");
+    let mut sets = SceneSets::new(Generator::new(settings).unwrap(), 3, "random".into()).unwrap();
+    let options = RecorderOptions { color: ColorCodec::Raw, ..RecorderOptions::default() };
+    let report =
+        crate::import(&mut sets, Arc::new(RealFs), &out, options, &mut |_| ControlFlow::Continue(()));
+    assert_eq!(report.unwrap().facts.lost, 0);
+
+    let dataset = Dataset::open(&out).unwrap();
+    let names: Vec<String> = dataset.session().streams.iter().map(|s| s.id.to_string()).collect();
+    assert_eq!(names, ["d435/color", "d435/depth", "d435/depth_true_color"]);
+    let mut number = 0;
+    for set in dataset.sets(SetRange::default()) {
+        let set = set.unwrap();
+        let sample = made.sample(number).unwrap();
+        let units = |v: &[u16]| v.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
+        let expected = [sample.color, units(&sample.raw), units(&sample.truth)];
+        for (frame, pixels) in set.frames.iter().zip(&expected) {
+            assert_eq!(frame.pixels, *pixels, "set {number}, {}", names[frame.stream]);
+            assert_eq!(frame.header.intrinsics, sample.intrinsics);
+            assert_eq!(frame.header.capture_time_ns, number as i64 * 200_000_000);
+        }
+        assert_eq!(set.frames.len(), 3);
+        number += 1;
+    }
+    assert_eq!(number, 3);
+    // The default lens differs from one sample to the next.
+    assert_ne!(generator().sample(0).unwrap().intrinsics, generator().sample(1).unwrap().intrinsics);
+    let refused = |settings: Settings| {
+        let sets = SceneSets::new(Generator::new(settings).unwrap(), 3, "random".into());
+        sets.err().map(|e| e.to_string()).unwrap_or_default()
+    };
+    assert!(refused(generator().settings().clone()).contains("nominal"));
+    let two = vec!["d435".to_owned(), "l515".to_owned()];
+    assert!(
+        refused(Settings { cameras: two, nominal_lens: true, ..Settings::default() }).contains("d435,l515")
+    );
 }

@@ -22,6 +22,48 @@ fn a_sample_depends_on_seed_and_number_alone() {
     assert_ne!(generator.sample(7).unwrap().truth, fifth.truth);
 }
 
+#[test]
+fn another_measurement_is_of_the_same_world_and_not_the_same() {
+    for sensor in [Sensor::Statistical, Sensor::Stereo] {
+        let made = |again| {
+            Generator::new(Settings { sensor, again, ..settings(&["d435"]) }).unwrap().sample(4).unwrap()
+        };
+        let [first, second, third] = [made(0), made(1), made(2)];
+        assert_eq!((&first.color, &first.truth), (&second.color, &second.truth), "{sensor:?}");
+        assert_eq!(second, made(1));
+        let differ = |a: &Triplet, b: &Triplet| a.raw.iter().zip(&b.raw).filter(|(a, b)| a != b).count();
+        let pixels = first.raw.len();
+        assert!(differ(&first, &second) * 10 > pixels && differ(&second, &third) * 10 > pixels, "{sensor:?}");
+    }
+}
+
+#[test]
+fn a_world_as_meshes_is_that_of_the_sample() {
+    let generator = Generator::new(settings(&["d435"])).unwrap();
+    for number in [0, 3] {
+        let sample = generator.sample(number).unwrap();
+        let world = generator.world(number);
+        assert_eq!((&world.truth, &world.material), (&sample.truth, &sample.material));
+        // Where a pixel sees a part, one of the part's corners is near.
+        let axes: Vec<glam::DVec3> = world.camera.iter().map(|c| glam::DVec3::from_array(*c)).collect();
+        let k = &world.intrinsics;
+        for (i, part) in world.part.iter().enumerate().step_by(97) {
+            let z = f64::from(world.truth[i]) * TRUTH_UNIT_M;
+            if z == 0.0 {
+                continue;
+            }
+            let x = ((i % 192) as f64 - k.cx) / k.fx;
+            let y = ((i / 192) as f64 - k.cy) / k.fy;
+            let place = (axes[3] + (axes[0] * x + axes[1] * y + axes[2]) * z).as_vec3();
+            let part = &world.parts[usize::from(*part)];
+            assert_eq!(part.material, world.material[i]);
+            let off = part.corners.iter().map(|c| (Vec3::from(*c) - place).length()).fold(9.0, f32::min);
+            let pixel = z as f32 / k.fx as f32;
+            assert!(off < 4.0 * pixel, "{number}: pixel {i}: {off} m, a pixel is {pixel} m wide");
+        }
+    }
+}
+
 /// Share of holes, and median error in metres of what was measured, by material.
 fn quality(samples: &[Triplet], material: u8) -> (f64, f64) {
     let mut holes = 0;

@@ -58,8 +58,7 @@ impl Lathe {
         }
     }
 
-    /// Radius and height of the outline's corners, for tests.
-    #[cfg(test)]
+    /// Radius and height of the outline's corners.
     pub(crate) fn outline(&self) -> Vec<(f64, f64)> {
         self.sides.iter().map(|s| s.a).chain(self.sides.last().map(|s| s.b)).map(|p| (p.x, p.y)).collect()
     }

@@ -143,8 +143,7 @@ impl Mesh {
         if smooth.dot(d) * facing < -1e-3 { smooth * facing } else { flat * facing }
     }
 
-    /// Every triangle, for tests.
-    #[cfg(test)]
+    /// Every triangle.
     pub(crate) fn triangles(&self) -> &[[Vec3; 3]] {
         &self.triangles
     }

@@ -11,11 +11,11 @@ import torch
 from ..config import ModelConfig
 from ..errors import LabError, first_line
 from .cdm import Cdm
-from .noise import NoiseNet
+from .noise import NoiseConv, NoiseNet
 from .tiny import Tiny
 from .vit import SIZES
 
-__all__ = ["Cdm", "NoiseNet", "Tiny", "build", "load_weights"]
+__all__ = ["Cdm", "NoiseConv", "NoiseNet", "Tiny", "build", "load_weights", "noise_net"]
 
 
 def build(config: ModelConfig) -> Any:
@@ -25,10 +25,16 @@ def build(config: ModelConfig) -> Any:
     elif config.kind == "cdm":
         net = Cdm(SIZES[config.encoder])
     else:
-        net = NoiseNet(SIZES[config.encoder], 4 if config.refined_input else 3)
+        net = noise_net(config)
     if config.weights is not None:
         load_weights(net, Path(config.weights))
     return net
+
+
+def noise_net(config: ModelConfig) -> NoiseConv | NoiseNet:
+    """Return a hole or value model of the configured form."""
+    channels = 4 if config.refined_input else 3
+    return NoiseConv(channels, config.width) if config.encoder == "conv" else NoiseNet(SIZES[config.encoder], channels)
 
 
 def load_weights(net: Any, path: Path) -> list[str]:

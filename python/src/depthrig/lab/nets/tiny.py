@@ -1,8 +1,12 @@
-"""A small refiner for CPUs: multiplies filled inverse depth by exp(r), |r| <= 2.
+"""A small refiner for CPUs: multiplies filled inverse depth in holes by exp(r), |r| <= 2.
 
-It works at half resolution and below, because stages of full size are bound by memory. Every layer is a convolution,
-a group norm or an activation; a convolution of 2x2 with stride 2 takes pixels apart and a transposed one puts them
-together, which is what unshuffle and shuffle are.
+Planes through what was measured (`planes`) are guesses at what lies in a hole; the network says how far to go from the
+filled depth to each of them, and what to add. What was measured stays as it was, and so does a hole of which the
+network knows little: a small r becomes 0.
+
+It works at an eighth of the resolution and below. Every learned layer is a convolution, a group norm or an activation;
+a convolution of 8x8 with stride 8 takes pixels apart and a transposed one puts them together, which is what unshuffle
+and shuffle are.
 """
 
 from __future__ import annotations
@@ -11,16 +15,22 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from .planes import CELL, FEATURES, GUESSES, planes
+
 __all__ = ["CHANNELS", "MULTIPLE", "REACH", "Tiny", "tiny_inputs"]
 
 CHANNELS = 6
 """Colour, filled and raw inverse depth divided by the mean of the filled one, 1 where raw depth was measured."""
 MULTIPLE = 16
 """Sides of an input are multiples of this."""
-DILATIONS = ((1,), (1, 1), (1, 2, 1), (1, 2, 4, 1))
+DILATIONS = ((1, 2, 1), (1, 2, 4, 8, 1))
 """Of the blocks of each stage on the way down: holes are often larger than what plain blocks see."""
 REACH = 2.0
 """The largest |r|."""
+STAY, STAY_TRAINING = 0.07, 0.02
+"""|r| becomes smaller by this, down to 0; while training by less, as what is 0 does not learn."""
+KEPT = 1e-3
+"""Measured depth that filling changed by more than this part was wrong, and counts as a hole."""
 
 
 def tiny_inputs(color: Tensor, filled: Tensor, raw: Tensor) -> Tensor:
@@ -31,8 +41,8 @@ def tiny_inputs(color: Tensor, filled: Tensor, raw: Tensor) -> Tensor:
     :param raw: `(batch, height, width)`, 1/m, 0 for a hole.
     """
     mean = filled.mean((1, 2), keepdim=True).clamp_min(1e-6)
-    planes = torch.stack([filled / mean, raw / mean, (raw > 0).to(filled.dtype)], 1)
-    return torch.cat([color - 0.5, planes], 1)
+    depths = torch.stack([filled / mean, raw / mean, (raw > 0).to(filled.dtype)], 1)
+    return torch.cat([color - 0.5, depths], 1)
 
 
 def _norm(channels: int) -> nn.GroupNorm:
@@ -65,22 +75,25 @@ def _stage(channels: int, dilations: tuple[int, ...]) -> nn.Sequential:
 class Tiny(nn.Module):
     """Refined inverse depth, from `tiny_inputs` and the filled inverse depth.
 
-    :param width: channels at half resolution; a multiple of 8.
+    :param width: channels at an eighth of the resolution; a multiple of 8.
     """
 
-    def __init__(self, width: int = 32):
+    def __init__(self, width: int = 48):
         super().__init__()
-        widths = (width, width * 3 // 2 // 8 * 8, 2 * width, 3 * width)
-        self.apart = nn.Conv2d(CHANNELS, widths[0], 2, 2)
+        widths = (width, 2 * width)
+        guesses = len(GUESSES)
+        self.apart = nn.Conv2d(CHANNELS + 1, widths[0], CELL, CELL)
+        self.hint = nn.Conv2d(guesses * (1 + FEATURES), widths[0], 1)
         self.encode = nn.ModuleList(_stage(w, n) for w, n in zip(widths, DILATIONS, strict=True))
-        self.down = nn.ModuleList(nn.Conv2d(a, b, 2, 2) for a, b in zip(widths, widths[1:], strict=False))
-        self.up = nn.ModuleList(nn.ConvTranspose2d(b, a, 2, 2) for a, b in zip(widths, widths[1:], strict=False))
-        self.decode = nn.ModuleList(_stage(w, n) for w, n in zip(widths, ((1,), (1,), (1, 1)), strict=False))
-        self.together = nn.ConvTranspose2d(widths[0], 1, 2, 2)
-        # It begins as the identity.
+        self.down = nn.Conv2d(*widths, 2, 2)
+        self.up = nn.ConvTranspose2d(*widths[::-1], 2, 2)
+        self.decode = _stage(widths[0], (1, 1))
+        self.together = nn.ConvTranspose2d(widths[0], guesses + 1, CELL, CELL)
+        # It begins with a part of each guess, and nothing to add.
         nn.init.zeros_(self.together.weight)
         assert self.together.bias is not None
-        nn.init.zeros_(self.together.bias)
+        nn.init.constant_(self.together.bias, -2.0)
+        nn.init.zeros_(self.together.bias[guesses:])
         for module in self.modules():
             if isinstance(module, _Inverted):
                 nn.init.zeros_(module.norm3.weight)
@@ -91,14 +104,22 @@ class Tiny(nn.Module):
         :param x: `(batch, 6, height, width)`.
         :param filled: `(batch, height, width)`, 1/m.
         """
-        x = self.apart(x)
-        skips = []
-        for stage, down in zip(self.encode, self.down, strict=False):
-            x = stage(x)
-            skips.append(x)
-            x = down(x)
-        x = self.encode[-1](x)
-        for up, stage in zip(reversed(self.up), reversed(self.decode), strict=True):
-            x = stage(up(x) + skips.pop())
-        r = REACH * torch.tanh(self.together(x) / REACH)
-        return filled * torch.exp(r.squeeze(1))
+        # In 16 bits sums of squares would be noise.
+        with torch.autocast(x.device.type, enabled=False):
+            here, raw, measured = x[:, 3:4].clamp_min(1e-6), x[:, 4:5], x[:, 5:6]
+            known = measured * ((raw - here).abs() <= KEPT * here).to(x.dtype)
+            hole = 1 - known
+            guesses, features = planes(raw * known, known)
+            ways = (guesses / F.avg_pool2d(here, CELL)).log().clamp(-REACH, REACH)
+        y = self.apart(torch.cat([x, hole], 1)) + self.hint(torch.cat([ways, features], 1))
+        y = self.encode[0](y)
+        y = self.decode(y + self.up(self.encode[1](self.down(y))))
+        parts = self.together(y).float()
+        with torch.autocast(x.device.type, enabled=False):
+            guesses = F.interpolate(guesses, scale_factor=float(CELL), mode="bilinear", align_corners=False)
+            ways = (guesses / here).log().clamp(-REACH, REACH)
+            r = (torch.sigmoid(parts[:, :-1]) * ways).sum(1, keepdim=True) + parts[:, -1:]
+            r = r.clamp(-REACH, REACH)
+            stay = STAY_TRAINING if self.training else STAY
+            r = hole * (r - r.clamp(-stay, stay))
+            return filled * torch.exp(r.squeeze(1))
