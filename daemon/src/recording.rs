@@ -7,10 +7,10 @@ use crate::status::{RecordingStatus, SetAccount};
 use crate::stream::Stream;
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
-use depthrig_bus::{DropCounts, Frame, HostTime, StreamId, UtcPair};
+use depthrig_bus::{DropCounts, Frame, HostTime, SignalSample, StreamId, UtcPair};
 use depthrig_recorder::{
     Diagnostic, Episode, EpisodeEnd, Pixels, RecordFrame, RecordSet, Recorder, RecorderOptions, Session,
-    StreamAccount, Summary, UtcSource, fs,
+    SignalRecord, StreamAccount, Summary, UtcSource, fs,
 };
 use place::place;
 pub use recovery::recover_left;
@@ -25,8 +25,10 @@ mod motion;
 mod place;
 mod recovery;
 mod report;
+mod signals;
 mod spread;
 mod texts;
+mod waiting;
 
 pub use closing::{Finishing, is_due, stop, stop_when_due};
 pub use facts::StreamFacts;
@@ -42,6 +44,8 @@ pub struct Recording {
     losses: LossHistory,
     /// Accounts of IMU batches, recorded or not.
     motion: motion::Books,
+    /// The signals that are published.
+    signals: signals::Known,
 }
 
 /// Resources of the computer that recordings use: its disk and its clocks.
@@ -77,6 +81,7 @@ struct Active {
     indices: HashMap<StreamId, usize>,
     streams: Vec<Recorded>,
     motion: motion::Units,
+    signals: signals::Signals,
     started: HostTime,
     /// When it ends by itself.
     ends: Option<HostTime>,
@@ -103,7 +108,7 @@ impl Pixels for SharedPixels {
 }
 
 impl Begun {
-    /// Creates the dataset for a recording of `streams`, of about `sets_hz` sets a second.
+    /// Creates the dataset for a recording of `streams` and `signals`, of about `sets_hz` sets a second.
     ///
     /// # Errors
     /// `WrongState` without a stream, `BadInput` for an invalid or existing folder name and for an invalid time,
@@ -112,6 +117,7 @@ impl Begun {
         config: &RigConfig,
         request: &RecordRequest,
         streams: Vec<StreamFacts>,
+        signals: Vec<SignalRecord>,
         sets_hz: f64,
         outside: &Outside,
     ) -> Result<Self> {
@@ -141,6 +147,10 @@ impl Begun {
         let firmware = streams.iter().filter(|s| !s.firmware.is_empty());
         session.firmware = firmware.map(|s| (s.stream.id.camera.to_string(), s.firmware.clone())).collect();
         describe(&mut session, &streams, &units);
+        // Those that have the name of a stream are refused when their first sample comes.
+        let of_camera = |r: &SignalRecord| streams.iter().chain(&units).any(|s| s.stream.id == r.id);
+        let signals: Vec<_> = signals.into_iter().filter(|r| !of_camera(r)).collect();
+        session.signals.clone_from(&signals);
         let mut options = options_of(&config.recording);
         options.backlog_max_bytes = outside.backlog_max_bytes.unwrap_or(options.backlog_max_bytes);
         options.late_after_ns = outside.late_after_ns;
@@ -182,6 +192,7 @@ impl Begun {
             indices: streams.iter().enumerate().map(|(i, s)| (s.stream.id.clone(), i)).collect(),
             streams: streams.iter().map(recorded).collect(),
             motion: motion::Units::new(&units, sets_hz),
+            signals: signals::Signals::new(signals),
             started,
             ends: request.max_duration_s.map(|s| started.plus(Duration::from_secs_f64(s))),
             utc: Arc::clone(&outside.utc),
@@ -242,7 +253,24 @@ impl Recording {
         self.motion.accounts().map(|(id, account)| (id.clone(), account)).collect()
     }
 
-    /// Hands a set to the recorder, with the motion that came since the set before, if a recording is running. Never blocks.
+    /// Takes in samples of the signal `id`, before which `missed` were replaced on the channel. While a recording runs
+    /// they wait for the next set.
+    pub fn hear_signal(&mut self, id: &StreamId, samples: Vec<SignalSample>, missed: u64) {
+        let recording = self.active.as_mut().map(|a| (&mut a.signals, &a.recorder));
+        self.signals.hear(recording, id, samples, missed);
+    }
+
+    /// Forgets the signals that nobody publishes any more: a recording that begins does not list them.
+    pub fn keep_signals(&mut self, is_published: impl Fn(&StreamId) -> bool) {
+        self.signals.keep(is_published);
+    }
+
+    /// The signals that are published, for a recording that begins.
+    pub fn signals(&self) -> Vec<SignalRecord> {
+        self.signals.records()
+    }
+
+    /// Hands a set to the recorder, with motion and signals since the set before, if a recording is running. Never blocks.
     pub fn offer(
         &mut self,
         id: u64,
@@ -268,7 +296,8 @@ impl Recording {
         let spread_ns = times.clone().max().unwrap_or(0) - times.min().unwrap_or(0);
         let utc = (active.utc)();
         let motion = self.motion.take(&mut active.motion);
-        self.push(RecordSet { id, tick, utc, frames: present, missing, motion, spread_ns });
+        let signals = active.signals.take();
+        self.push(RecordSet { id, tick, utc, frames: present, missing, motion, signals, spread_ns });
     }
 
     /// Hands a set to the recorder, if one is running; its streams and IMUs are those that the recording was begun
@@ -276,6 +305,7 @@ impl Recording {
     pub fn push(&mut self, set: RecordSet) {
         let Some(active) = &mut self.active else { return };
         active.motion.hand_over(&set.motion);
+        active.signals.hand_over(&set.signals);
         let missing = set.missing.clone();
         // A set that is refused is counted and logged by the recorder.
         if active.recorder.push(set).is_ok() {
@@ -469,7 +499,7 @@ impl Active {
                 dropped,
             }
         };
-        self.streams.iter().map(account).chain(self.motion.accounts())
+        self.streams.iter().map(account).chain(self.motion.accounts()).chain(self.signals.accounts())
     }
 }
 

@@ -20,6 +20,7 @@
 mod control;
 mod player;
 mod refine;
+mod signals;
 mod source;
 mod timeline;
 mod transport;
@@ -213,7 +214,7 @@ impl Replay {
         let bus = Arc::new(Bus::open(runtime, &rig)?);
         bus.clean_dead();
         let inner = Arc::new(Inner::new(config, datasets, options, timeline, sources));
-        let player = Player::new(Arc::clone(&inner), Arc::clone(&bus))?;
+        let player = Player::new(Arc::clone(&inner), Arc::clone(&bus), runtime)?;
         let refinements =
             options.refine.map(|engine| refine::refinements(&inner, &bus, engine)).transpose()?;
         let mut replay = Self { inner, threads: Vec::new(), api: None, _lock: held };

@@ -5,6 +5,7 @@
 //! camera threads    ── driver → gate → slot on the bus
 //! stage thread      ── bus → pairs of colour and depth → refine threads → bus
 //! set thread        ── bus → frame sets → bus, recorder
+//! signal thread     ── signals of the robot → recorder
 //! housekeeping      ── once a second: dead subscribers, accounts into the file, CPU; ends a recording that is due
 //! API thread        ── HTTP on the rig's socket
 //! ```
@@ -16,6 +17,7 @@ mod inner;
 mod join;
 mod motion;
 pub(crate) mod report;
+mod signals;
 mod threads;
 
 use crate::api::{self, ServerHandle};
@@ -221,6 +223,7 @@ impl Rig {
             held_sets: AtomicUsize::new(0),
         });
         let assembly = Assembly::new(Arc::clone(&inner))?;
+        let signals = signals::Collector::new(Arc::clone(&inner))?;
         let mut rig = Self { threads: Vec::new(), recovery: None, api: None, inner, _lock: lock };
         // Before the cameras: a long start can then be asked about.
         if options.serve_api {
@@ -238,6 +241,7 @@ impl Rig {
             rig.spawn("stage", move |stop| stage.run(stop))?;
         }
         rig.spawn("sets", move |stop| assembly.run(stop))?;
+        rig.spawn("signals", move |stop| signals.run(stop))?;
         let inner = Arc::clone(&rig.inner);
         rig.spawn("housekeeping", move |stop| housekeeping(&inner, stop))?;
         if rig.inner.config.recording.recover_on_start {

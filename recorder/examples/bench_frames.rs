@@ -91,6 +91,7 @@ fn set(session: &Session, pool: &[Pair], lent: bool, n: u64, begin: HostTime, ut
         frames: frames.collect(),
         missing: Vec::new(),
         motion: Vec::new(),
+        signals: Vec::new(),
         spread_ns: 0,
     }
 }

@@ -93,6 +93,7 @@ fn record(dir: &Path, bytes: u64) {
             frames: frames.collect(),
             missing: Vec::new(),
             motion: Vec::new(),
+            signals: Vec::new(),
             spread_ns: 0,
         };
         r.push(set).unwrap();

@@ -101,6 +101,7 @@ fn main() {
             frames: frames.collect(),
             missing: Vec::new(),
             motion: Vec::new(),
+            signals: Vec::new(),
             spread_ns: 0,
         };
         recorder.push(set).unwrap();

@@ -190,6 +190,7 @@ fn set(sources: &[Source], id: u64, tick: HostTime, utc: UtcPair) -> RecordSet {
         frames: frames.collect(),
         missing: Vec::new(),
         motion: Vec::new(),
+        signals: Vec::new(),
         spread_ns: 0,
     }
 }

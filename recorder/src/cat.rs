@@ -18,8 +18,12 @@ use std::path::{Path, PathBuf};
 mod growing;
 mod motion;
 mod row;
-pub use motion::{MotionForm, MotionRow, export_motion, list_motion};
+mod samples;
+mod signal;
+pub use motion::MotionRow;
 pub use row::FrameRow;
+pub use samples::{SampleForm, SampleRow, export_samples, list_samples, sampled};
+pub use signal::SignalRow;
 
 /// The list beside the images.
 pub const FRAMES_FILE: &str = "frames.csv";
@@ -251,9 +255,8 @@ impl<'a> Chosen<'a> {
         for wanted in &choice.streams {
             if !known.iter().any(|s| s.id == *wanted) {
                 let names: Vec<_> = known.iter().map(|s| s.id.to_string()).collect();
-                let unit = dataset.session().motion.iter().any(|u| u.id == *wanted);
-                let what = if unit {
-                    format!("{wanted} is an IMU and has no images; ask for IMUs by themselves")
+                let what = if sampled(dataset.session()).any(|id| id == wanted) {
+                    format!("{wanted} is an IMU or a signal and has no images; ask for these by themselves")
                 } else {
                     format!("there is no stream {wanted}; the dataset has {}", names.join(", "))
                 };

@@ -8,7 +8,7 @@
 
 use crate::dataset::{Dataset, DatasetFrame, DatasetSet, PixelMode, SetRange, Sets};
 use crate::{ErrorKind, RecordMotion, Result};
-use depthrig_bus::StreamId;
+use depthrig_bus::{SignalFlags, SignalSample, StreamId};
 use serde::Serialize;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::ops::ControlFlow;
@@ -74,6 +74,8 @@ pub struct Comparison {
     pub frames: u64,
     /// Batches of IMUs that are in both.
     pub batches: u64,
+    /// Samples of signals that both have.
+    pub signal_samples: u64,
     /// How many differences there are, by stream and field.
     pub counts: Vec<FieldCount>,
     /// The first of them.
@@ -159,6 +161,7 @@ struct Walk<'a> {
     sets: u64,
     frames: u64,
     batches: u64,
+    samples: u64,
     counts: BTreeMap<(String, String), u64>,
     differences: Vec<Difference>,
     pixels: BTreeMap<String, PixelDifference>,
@@ -182,6 +185,7 @@ impl<'a> Walk<'a> {
             sets: 0,
             frames: 0,
             batches: 0,
+            samples: 0,
             counts: BTreeMap::new(),
             differences: Vec::new(),
             pixels: BTreeMap::new(),
@@ -231,6 +235,25 @@ impl<'a> Walk<'a> {
             }
         }
         self.units();
+        self.signal_records();
+    }
+
+    /// Compares the signals of both `session.toml`.
+    fn signal_records(&mut self) {
+        let [a, b] = self.datasets.map(|d| &d.session().signals);
+        for x in a {
+            let name = x.id.to_string();
+            match b.iter().find(|y| y.id == x.id) {
+                Some(y) if x.description == y.description => {}
+                Some(y) => {
+                    self.add(At::default(), &name, "description", x.description.json(), y.description.json());
+                }
+                None => self.add_on(A, At::default(), &name, "signal", "recorded".into()),
+            }
+        }
+        for y in b.iter().filter(|y| !a.iter().any(|x| x.id == y.id)) {
+            self.add_on(B, At::default(), &y.id.to_string(), "signal", "recorded".into());
+        }
     }
 
     /// Compares the IMUs of both `session.toml`.
@@ -344,6 +367,7 @@ impl<'a> Walk<'a> {
             check("utc_offset_ns", a.utc_offset_ns, b.utc_offset_ns);
         }
         self.motion(at, a, b);
+        self.signals(at, a, b);
         let [a, b] = [(A, a), (B, b)].map(|(side, set)| self.by_name(side, set));
         for (name, x) in &a {
             match b.get(name) {
@@ -396,6 +420,63 @@ impl<'a> Walk<'a> {
         if let Some(n) = at_sample {
             let [x, y] = [a, b].map(|m| m.samples.get(n).map_or(NOTHING.to_owned(), |s| format!("{s:?}")));
             self.add(at, name, "samples", x, y);
+        }
+    }
+
+    /// The samples of signals of a set, those of each signal in their order.
+    fn signals(&mut self, at: At, a: &DatasetSet, b: &DatasetSet) {
+        let [mut x, mut y] = [(A, a), (B, b)].map(|(side, set)| {
+            let signals = &self.datasets[side].session().signals;
+            let mut of: BTreeMap<String, Vec<&SignalSample>> = BTreeMap::new();
+            for part in &set.signals {
+                if let Some(signal) = signals.get(part.signal) {
+                    of.entry(signal.id.to_string()).or_default().extend(&part.samples);
+                }
+            }
+            of
+        });
+        let names: BTreeSet<String> = x.keys().chain(y.keys()).cloned().collect();
+        for name in names {
+            let x = x.remove(&name).unwrap_or_default();
+            let y = y.remove(&name).unwrap_or_default();
+            for (a, b) in x.iter().zip(&y) {
+                self.signal_sample(at, &name, a, b);
+            }
+            for (side, lone) in [(A, x.iter().skip(y.len())), (B, y.iter().skip(x.len()))] {
+                for sample in lone {
+                    self.add_on(side, at, &name, "sample", format!("number {}", sample.header().sequence));
+                }
+            }
+        }
+    }
+
+    /// Two samples of one signal, their values bit by bit. Publisher and number are passage, and so is `replayed`.
+    fn signal_sample(&mut self, at: At, name: &str, a: &SignalSample, b: &SignalSample) {
+        self.samples += 1;
+        let passage = if self.options.strict { 0 } else { SignalFlags::REPLAYED.0 };
+        let identity = |s: &SignalSample| {
+            let h = *s.header();
+            [
+                ("time_ns", h.time_ns.to_string()),
+                ("publish_time_ns", h.publish_time_ns.to_string()),
+                ("uncertainty_ns", h.uncertainty_ns.to_string()),
+                ("flags", (h.flags & !passage).to_string()),
+            ]
+        };
+        for ((field, x), (_, y)) in identity(a).into_iter().zip(identity(b)) {
+            if x != y {
+                self.add(at, name, field, x, y);
+            }
+        }
+        if a.bytes() != b.bytes() {
+            let [x, y] = [a, b].map(|s| format!("{:?}", s.values().collect::<Vec<_>>()));
+            self.add(at, name, "values", x, y);
+        }
+        if self.options.strict {
+            let [x, y] = [a, b].map(|s| (s.header().session, s.header().sequence));
+            if x != y {
+                self.add(at, name, "sequence", format!("{x:?}"), format!("{y:?}"));
+            }
         }
     }
 
@@ -477,6 +558,7 @@ impl<'a> Walk<'a> {
             sets: self.sets,
             frames: self.frames,
             batches: self.batches,
+            signal_samples: self.samples,
             counts: self.counts.into_iter().map(count).collect(),
             differences: self.differences,
             pixel_differences: self.pixels.into_values().filter(|p| p.frames_differing > 0).collect(),

@@ -12,6 +12,7 @@ mod filter;
 mod index;
 mod info;
 mod sets;
+mod signals;
 
 pub(crate) use decode::check_stored;
 #[cfg(any(test, feature = "testing"))]
@@ -19,10 +20,11 @@ pub(crate) use decode::color_decodes;
 pub use decode::jpeg_pixels;
 pub use filter::PixelFilter;
 pub use index::SetReader;
-pub use info::{AttachedCalibration, DatasetInfo, MotionInfo, SpreadStats, StreamInfo};
+pub use info::{AttachedCalibration, DatasetInfo, MotionInfo, SignalInfo, SpreadStats, StreamInfo};
 pub(crate) use info::{MotionCount, image_chunks};
 pub use sets::{DatasetFrame, DatasetSet, PixelMode, SetRange, Sets};
 pub(crate) use sets::{Kind, kind_of, kinds};
+pub(crate) use signals::SignalCount;
 
 /// A dataset opened for reading: a folder, or one segment of one.
 #[derive(Debug, Clone)]

@@ -1,6 +1,8 @@
 //! The input of the recorder: sets of frames whose pixels still lie in shared memory.
 
-use depthrig_bus::{FrameHeader, HostTime, MOTION_SAMPLE_BYTES, MotionSample, UtcPair};
+use depthrig_bus::{
+    FrameHeader, HostTime, MOTION_SAMPLE_BYTES, MotionSample, SignalDescription, SignalSample, UtcPair,
+};
 
 /// The pixels of a frame, wherever they lie. The recorder drops the box as soon as it has encoded them, or where they
 /// [may wait](Pixels::may_wait) and are stored as they are, written them.
@@ -86,6 +88,60 @@ impl RecordMotion {
     }
 }
 
+/// Samples of a signal, as its channel carried them.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RecordSignal {
+    /// Index of the signal in `Session::signals`.
+    pub signal: usize,
+    /// Its samples in their order, all of one publisher.
+    pub samples: Vec<SignalSample>,
+}
+
+/// The samples of signals of a set take at most this many bytes in the file, see [`RecordSignal::stored_bytes`].
+pub const SET_SIGNALS_MAX_BYTES: u64 = 64 << 20;
+
+impl RecordSignal {
+    /// About how many bytes these samples take in the file, before the chunk is packed.
+    pub fn stored_bytes(&self) -> u64 {
+        let of = |s: &SignalSample| Self::sample_bytes(s.description(), s.bytes().len());
+        self.samples.iter().map(of).fold(256, u64::saturating_add)
+    }
+
+    /// The same of one sample with so many bytes of values.
+    pub fn sample_bytes(description: &SignalDescription, values: usize) -> u64 {
+        // In both messages the values, which are widened in the second one, and there name, type and unit of each field.
+        let names: usize = description.all_fields().iter().map(|f| f.name.len() + f.unit.len() + 48).sum();
+        (160 + names + description.frame().len() + 9 * values) as u64
+    }
+}
+
+/// Bytes of the messages that wait for the mark of a set, and belong to no image.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Waiting {
+    motion: u64,
+    signals: u64,
+}
+
+impl Waiting {
+    /// Takes in a message of `bytes` of an IMU; the error in words if a set has too many.
+    pub(crate) fn motion(&mut self, bytes: usize) -> Result<(), String> {
+        Self::add(&mut self.motion, bytes, SET_MOTION_MAX_BYTES, "motion")
+    }
+
+    /// The same of a signal.
+    pub(crate) fn signal(&mut self, bytes: usize) -> Result<(), String> {
+        Self::add(&mut self.signals, bytes, SET_SIGNALS_MAX_BYTES, "signals")
+    }
+
+    fn add(sum: &mut u64, bytes: usize, most: u64, what: &str) -> Result<(), String> {
+        *sum = sum.saturating_add(bytes as u64);
+        if *sum <= most {
+            return Ok(());
+        }
+        Err(format!("a set has more than {most} bytes of {what} before its mark"))
+    }
+}
+
 /// One set: at most one frame of each stream, all of about the same moment.
 pub struct RecordSet {
     /// Number of the set; each is greater than the one before.
@@ -102,6 +158,8 @@ pub struct RecordSet {
     /// The IMU batches since the set before, in order of arrival. They are lost with a set that is not recorded, so
     /// that the numbers of batches and samples show the gap.
     pub motion: Vec<RecordMotion>,
+    /// The samples of signals since the set before, those of each signal in order. They too are lost with the set.
+    pub signals: Vec<RecordSignal>,
     /// Latest minus earliest capture time, nanoseconds.
     pub spread_ns: i64,
 }

@@ -49,8 +49,8 @@ pub mod trigger;
 mod verify;
 
 pub use cat::{
-    FRAMES_FILE, FrameChoice, FrameRow, FramesDone, MotionForm, MotionRow, SetChoice, export_frames,
-    export_motion, list_frames, list_motion,
+    FRAMES_FILE, FrameChoice, FrameRow, FramesDone, MotionRow, SampleForm, SampleRow, SetChoice, SignalRow,
+    export_frames, export_samples, list_frames, list_samples, sampled,
 };
 pub use catalog::{CatalogEntry, Health, catalog, look_at};
 pub use clock::utc_text;
@@ -60,11 +60,12 @@ pub use compare::{
 };
 pub use dataset::{
     AttachedCalibration, Dataset, DatasetFrame, DatasetInfo, DatasetSet, MotionInfo, PixelFilter, PixelMode,
-    SetRange, SetReader, Sets, SpreadStats, StreamInfo, jpeg_pixels, segment_number,
+    SetRange, SetReader, Sets, SignalInfo, SpreadStats, StreamInfo, jpeg_pixels, segment_number,
 };
 pub use error::{Error, ErrorKind, Result};
 pub use frame::{
-    IMAGE_MAX_BYTES, Pixels, PushError, RecordFrame, RecordMotion, RecordSet, SET_MOTION_MAX_BYTES, SetDrop,
+    IMAGE_MAX_BYTES, Pixels, PushError, RecordFrame, RecordMotion, RecordSet, RecordSignal,
+    SET_MOTION_MAX_BYTES, SET_SIGNALS_MAX_BYTES, SetDrop,
 };
 pub use live::{LiveChannel, LiveEncoder, LiveFrame, LiveSource, LiveTopics};
 pub use msgs::{Diagnostic, Level, SetCounts, StreamAccount};
@@ -79,8 +80,8 @@ pub use recover::{
 pub use select::{Edge, Moment, SetSpan};
 pub use session::{
     Computed, Derived, Edit, Episode, EpisodeCounts, EpisodeEnd, EpisodeOutcome, FORMAT, Mark, MotionRecord,
-    NOTE_MAX_BYTES, Note, Outcome, SESSION_FILE, Session, SessionChanges, StreamCalibration, StreamRecord,
-    UnitCalibration, check_name, edit, rename,
+    NOTE_MAX_BYTES, Note, Outcome, SESSION_FILE, Session, SessionChanges, SignalRecord, StreamCalibration,
+    StreamRecord, UnitCalibration, check_name, edit, rename,
 };
 pub use slice::{SliceOptions, SliceProgress, SliceReport, merge, trim};
 pub use still::{StillFormat, still};

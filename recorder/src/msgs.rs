@@ -8,6 +8,7 @@ pub(crate) mod frame_set;
 pub(crate) mod image;
 pub(crate) mod motion;
 pub(crate) mod schemas;
+pub(crate) mod signal;
 pub(crate) mod tf;
 
 pub use accounts::{SetCounts, StreamAccount};

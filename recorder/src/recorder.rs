@@ -34,7 +34,7 @@ pub use progress::{Progress, Summary};
 use resume::Past;
 pub use resume::Resumed;
 use ticket::{Job, Load, Ticket};
-use topics::Topics;
+use topics::{SampleNumber, Topics};
 use writer::Writer;
 
 /// The file that is deleted to make room for the index when the disk is full.
@@ -105,6 +105,8 @@ struct State {
     last_id: Option<u64>,
     /// Number of the last batch of each IMU.
     last_batches: Vec<Option<u64>>,
+    /// The last sample of each signal that had one.
+    last_samples: Vec<Option<SampleNumber>>,
     /// Places the recording in UTC.
     anchor: Option<UtcPair>,
     last_log_time: i64,
@@ -243,6 +245,7 @@ impl Recorder {
                 segments: past.segments + 1,
                 last_id: past.last_id,
                 last_batches: past.last_batches,
+                last_samples: past.last_samples,
                 anchor: past.anchor,
                 last_log_time: past.last_log_time,
                 first_tick: past.first_tick,
@@ -310,6 +313,9 @@ impl Recorder {
         if let Err(why) = self.shared.topics.check(&set, state.last_id, &state.last_batches) {
             return refused(&mut state, SetDrop::BadSet, why);
         }
+        if let Err(why) = Topics::check_signals(&set.signals, &state.session.signals, &state.last_samples) {
+            return refused(&mut state, SetDrop::BadSet, why);
+        }
         let options = &self.shared.options;
         let load = &self.shared.load;
         let unencoded = load.unencoded.load(Ordering::Relaxed);
@@ -340,6 +346,13 @@ impl Recorder {
         for batch in &ticket.motion {
             state.last_batches[batch.unit] = Some(batch.header.sequence);
         }
+        let signals = state.session.signals.len();
+        state.last_samples.resize(signals, None);
+        for part in &ticket.signals {
+            if let Some(last) = part.samples.last() {
+                state.last_samples[part.signal] = Some((last.header().session, last.header().sequence));
+            }
+        }
         state.last_log_time = log_time;
         state.first_tick.get_or_insert(ticket.tick);
         state.last_tick = Some(ticket.tick);
@@ -352,6 +365,18 @@ impl Recorder {
             drop(jobs.try_send(Job::new(Arc::clone(&ticket), slot, frame)));
         }
         Ok(())
+    }
+
+    /// Adds a signal that appeared after the recording began, and returns its index. The next set with a sample of it begins
+    /// a segment, because a segment names its channels at its head.
+    ///
+    /// # Errors
+    /// [`ErrorKind::BadInput`] when a stream or signal has its name already, or the dataset lists as many as it can.
+    pub fn add_signal(&self, signal: crate::SignalRecord) -> Result<usize> {
+        let mut state = self.shared.lock();
+        let index = state.session.add_signal(signal)?;
+        state.session_changed = true;
+        Ok(index)
     }
 
     /// Whether the next set would find room, for callers that would rather wait than lose one. True as well when it

@@ -90,6 +90,9 @@ pub struct Report {
     /// Its IMUs.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub motion: Vec<MotionReport>,
+    /// Its signals.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub signals: Vec<SignalReport>,
     /// The two clocks of the host.
     pub host_clock: HostClock,
     /// Bytes of its segments.
@@ -232,6 +235,41 @@ pub struct MotionReport {
     pub acceleration_series: Vec<Option<Range>>,
     /// `captured = delivered + Σ dropped` of its batches over the recording, from the last account in the file.
     pub account: Option<StreamAccount>,
+}
+
+/// One signal of a dataset.
+#[derive(Debug, Clone, Serialize)]
+#[non_exhaustive]
+pub struct SignalReport {
+    /// `device/signal`.
+    pub id: depthrig_bus::StreamId,
+    /// `fields`, `joints` or `pose`.
+    pub kind: &'static str,
+    /// Unit of the first field.
+    pub unit: String,
+    /// Samples in the dataset.
+    pub samples: u64,
+    /// Samples between the first and the last that are not in it.
+    pub lost: u64,
+    /// Number of times that another publisher took over.
+    pub restarts: u64,
+    /// Samples per second between the first and the last.
+    pub samples_hz: f64,
+    /// Losses and pauses in words.
+    pub remarks: Vec<String>,
+    /// The values of the first elements over time; none of a text.
+    pub fields: Vec<FieldSeries>,
+    /// `captured = delivered + Σ dropped` of its samples over the recording, from the last account in the file.
+    pub account: Option<StreamAccount>,
+}
+
+/// The values of one element of a signal.
+#[derive(Debug, Clone, Serialize)]
+pub struct FieldSeries {
+    /// Its field, with the place in it if the field has several.
+    pub name: String,
+    /// Over time, in the field's unit.
+    pub series: Vec<Option<Range>>,
 }
 
 /// The capture clock of a stream.

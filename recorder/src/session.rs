@@ -10,10 +10,12 @@ use std::path::Path;
 mod edit;
 mod episode;
 mod limits;
+mod signal;
 
 pub(crate) use edit::SessionText;
 pub use edit::{SessionChanges, StreamCalibration, UnitCalibration, check_name, edit, rename};
 pub use episode::{Episode, EpisodeCounts, EpisodeEnd, EpisodeOutcome};
+pub use signal::SignalRecord;
 
 /// The value of `Session::format` that this version writes and reads.
 pub const FORMAT: &str = "depthrig.dataset/1";
@@ -92,6 +94,9 @@ pub struct Session {
     /// The recorded IMUs, which are not streams of the sets; a batch names its IMU by the index here.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub motion: Vec<MotionRecord>,
+    /// The recorded signals, in the order in which they appeared; samples name their signal by the index here.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub signals: Vec<SignalRecord>,
     /// Keys that this version does not know: a user's own, or a later version's. They are kept.
     #[serde(flatten)]
     pub extra: toml::Table,
@@ -361,6 +366,7 @@ impl Session {
             derived: Vec::new(),
             computed: Vec::new(),
             motion: Vec::new(),
+            signals: Vec::new(),
             streams: Vec::new(),
             extra: toml::Table::new(),
         }
@@ -408,7 +414,42 @@ impl Session {
                 return Err(bad(format!("IMU {} has batches of no samples", u.id)));
             }
         }
+        for (i, s) in self.signals.iter().enumerate() {
+            self.may_add(&self.signals[..i], s)?;
+        }
         self.too_much().map_or(Ok(()), |why| Err(bad(why)))
+    }
+
+    /// Checks that `signal` can be recorded beside the streams, the IMUs and the signals `others`, whose topics must differ.
+    fn may_add(&self, others: &[SignalRecord], signal: &SignalRecord) -> Result<()> {
+        let id = &signal.id;
+        let of_cameras = self.streams.iter().map(|s| &s.id).chain(self.motion.iter().map(|u| &u.id));
+        let why = if others.iter().any(|other| other.id == *id) {
+            "it is recorded already"
+        } else if of_cameras.into_iter().any(|other| other == id) {
+            "a stream of a camera has the same name; rename one of them"
+        } else {
+            return Ok(());
+        };
+        Err(Error::new(ErrorKind::BadInput, format!("signal {id} is not recorded: {why}")))
+    }
+
+    /// Adds a signal and returns its index.
+    ///
+    /// # Errors
+    /// [`ErrorKind::BadInput`] when a stream or signal has its name, or the session is full.
+    pub(crate) fn add_signal(&mut self, signal: SignalRecord) -> Result<usize> {
+        self.may_add(&self.signals, &signal)?;
+        if self.listed() >= STREAMS_MAX {
+            let what = format!("signal {} is not recorded: the dataset has {STREAMS_MAX} streams", signal.id);
+            return Err(Error::new(ErrorKind::BadInput, what));
+        }
+        self.signals.push(signal);
+        Ok(self.signals.len() - 1)
+    }
+
+    fn listed(&self) -> usize {
+        self.streams.len() + self.motion.len() + self.signals.len()
     }
 
     /// Whether sets of `other` can be sets of this session: the same rig, streams and IMUs, whatever their
@@ -419,6 +460,12 @@ impl Session {
         self.rig == other.rig
             && self.streams.iter().map(stream).eq(other.streams.iter().map(stream))
             && self.motion.iter().map(unit).eq(other.motion.iter().map(unit))
+            && self.has_signals_as(other)
+    }
+
+    /// Whether the signals that both have are the same ones: one of them may have been recorded for longer.
+    pub(crate) fn has_signals_as(&self, other: &Self) -> bool {
+        self.signals.iter().zip(&other.signals).all(|(a, b)| a == b)
     }
 
     /// Whether streams and IMUs have the intrinsics and poses that those of `other` have.
@@ -442,9 +489,9 @@ impl Session {
 
     /// The first limit of a dataset that it exceeds, in words.
     fn too_much(&self) -> Option<String> {
-        let listed = self.streams.len() + self.motion.len();
+        let listed = self.listed();
         if listed > STREAMS_MAX {
-            return Some(format!("it lists {listed} streams and IMUs, {STREAMS_MAX} is the limit"));
+            return Some(format!("it lists {listed} streams, IMUs and signals, {STREAMS_MAX} is the limit"));
         }
         let fits = |u: &&MotionRecord| RecordMotion::stored_bytes_of(u.batch.into()) <= SET_MOTION_MAX_BYTES;
         let long = self.motion.iter().find(|u| !fits(u))?;

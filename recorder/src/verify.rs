@@ -3,7 +3,7 @@
 //! Checked are: the checksums of data, summary, chunks and attachments; the index against the data, record by
 //! record; that every set has what its commit mark lists, of the length and with the checksum that it lists, and
 //! that the mark lists or excuses every stream; order, times and spreads; the accounts, of sets, of streams and in
-//! the header of each frame; what IMUs sent; that segments follow each other; calibration; and on request that
+//! the header of each frame; what IMUs sent; that segments follow each other; signals; calibration; and on request that
 //! every image decodes and every single sample equals that of its batch.
 //!
 //! Without that request an image is unpacked only where nothing else proves its bytes, see `segment`.
@@ -24,6 +24,7 @@ mod records;
 mod seen;
 mod segment;
 mod sets;
+mod signals;
 
 pub(crate) use judge::{Judge, broken_session};
 use sets::Walk;
@@ -124,6 +125,8 @@ pub struct VerifyReport {
     pub frames: u64,
     /// Samples of IMUs.
     pub motion_samples: u64,
+    /// Samples of signals.
+    pub signal_samples: u64,
     /// Bytes read.
     pub bytes: u64,
     /// Segments read.
@@ -212,6 +215,7 @@ pub fn verify_watched(
         sets: walk.sets,
         frames: walk.frames,
         motion_samples: walk.units.samples(),
+        signal_samples: walk.signals.samples(),
         bytes: walk.bytes,
         segments: segments.len() as u32,
         decoded: options.decode,

@@ -56,6 +56,7 @@ fn recorded() -> MemFs {
             frames: vec![RecordFrame { stream: 0, header, pixels }],
             missing: Vec::new(),
             motion: Vec::new(),
+            signals: Vec::new(),
             spread_ns: 0,
         };
         recorder.push(set).unwrap();

@@ -174,6 +174,7 @@ fn write(dir: &Path, color: ColorCodec, depth: DepthCodec, stereo: bool) {
             tick: HostTime::from_ns(tick),
             utc: UtcPair { mono: HostTime::from_ns(MONO_NS), utc_ns: UTC_NS, width_ns: 200 },
             motion: motion(&session.motion[0], n),
+            signals: Vec::new(),
             spread_ns: times.iter().max().unwrap() - times.iter().min().unwrap(),
             missing: if n == 2 { vec![3] } else { Vec::new() },
             frames,

@@ -197,6 +197,7 @@ impl Fixture {
             tick: self.tick(n),
             utc: UtcPair { mono: self.tick(0), utc_ns: T0 + self.at_ns, width_ns: 100 },
             motion: self.batches(session, n),
+            signals: Vec::new(),
             spread_ns: times.clone().max().unwrap_or(0) - times.min().unwrap_or(0),
             missing: Vec::new(),
             frames,

@@ -235,6 +235,7 @@ impl SyntheticStereo {
                 frames,
                 missing,
                 motion: session.motion.iter().enumerate().map(|(i, u)| batch(i, u, n, mono)).collect(),
+                signals: Vec::new(),
                 spread_ns: 0,
             };
             while !r.has_room() {

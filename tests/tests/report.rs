@@ -68,6 +68,7 @@ fn the_fill_rate_of_a_report_is_that_of_the_metrics() {
             frames,
             missing: vec![],
             motion: Vec::new(),
+            signals: Vec::new(),
             spread_ns: 0,
         })
         .unwrap();

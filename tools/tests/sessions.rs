@@ -60,6 +60,7 @@ fn set(started_utc_ns: i64) -> RecordSet {
         frames: vec![frame],
         missing: vec![],
         motion: Vec::new(),
+        signals: Vec::new(),
         spread_ns: 0,
     }
 }

@@ -6,12 +6,13 @@
 //! recording ends came after its last set and are not recorded.
 
 use super::StreamFacts;
+use super::waiting::Waiting;
 use crate::status::SetAccount;
 use crate::stream::Stream;
 use depthrig_bus::{DropCounts, DropReason, Frame, StreamId};
 use depthrig_calib::PoseExt;
 use depthrig_recorder::{MotionRecord, RecordMotion, SET_MOTION_MAX_BYTES, StreamAccount};
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 /// How long batches wait for a set, seconds.
@@ -22,14 +23,11 @@ const LEAST_HZ: f64 = 10.0;
 /// The IMUs of one recording.
 pub(super) struct Units {
     units: Vec<Unit>,
-    waiting: VecDeque<RecordMotion>,
+    waiting: Waiting<RecordMotion>,
 }
 
 struct Unit {
     stream: Arc<Stream>,
-    /// Batches that may wait.
-    most: usize,
-    waiting: usize,
     /// Batches that went to the recorder with sets.
     handed: u64,
     /// Batches that were lost on the way here: replaced on the channel, or pushed out while they waited.
@@ -57,17 +55,17 @@ impl Units {
             let profile = &s.stream.profile;
             let of_sets = (profile.rate_hz.max(LEAST_HZ) * TIMEOUT_S.max(2.0 / sets_hz)).ceil();
             let fit = share / RecordMotion::stored_bytes_of(profile.width.into());
-            (of_sets as u64).min(fit).max(1) as usize
+            (of_sets as u64).min(fit).max(1)
         };
         let unit = |s: &StreamFacts| Unit {
             stream: Arc::clone(&s.stream),
-            most: most(s),
-            waiting: 0,
             handed: 0,
             lost: 0,
             dropped: DropCounts::default(),
         };
-        Self { units: units.iter().map(unit).collect(), waiting: VecDeque::new() }
+        let mut waiting = Waiting::new();
+        units.iter().for_each(|s| waiting.add_source(most(s)));
+        Self { units: units.iter().map(unit).collect(), waiting }
     }
 
     /// The recording begins now: losses from here on are its own.
@@ -84,25 +82,16 @@ impl Units {
         };
         let unit = &mut self.units[index];
         unit.lost += missed;
-        let mut heard = Heard::Waits;
-        if unit.waiting >= unit.most
-            && let Some(oldest) = self.waiting.iter().position(|m| m.unit == index)
-        {
-            self.waiting.remove(oldest);
-            unit.waiting -= 1;
-            unit.lost += 1;
-            heard = Heard::PushedOut;
-        }
-        unit.waiting += 1;
         let samples = frame.motion().collect();
-        self.waiting.push_back(RecordMotion { unit: index, header: *frame.header(), samples });
-        heard
+        let batch = RecordMotion { unit: index, header: *frame.header(), samples };
+        let gone = self.waiting.push(index, 1, batch);
+        unit.lost += gone;
+        if gone > 0 { Heard::PushedOut } else { Heard::Waits }
     }
 
     /// Everything that waits.
     fn take(&mut self) -> Vec<RecordMotion> {
-        self.units.iter_mut().for_each(|u| u.waiting = 0);
-        self.waiting.drain(..).collect()
+        self.waiting.take_all()
     }
 
     /// Counts the batches that go to the recorder with a set.
@@ -153,10 +142,11 @@ impl Books {
 
     /// Everything that waits in `units`, for the set that is handed over now.
     pub(super) fn take(&mut self, units: &mut Units) -> Vec<RecordMotion> {
-        for unit in &units.units {
+        for (index, unit) in units.units.iter().enumerate() {
             if let Some(account) = self.0.get_mut(&unit.stream.id) {
-                account.pending -= unit.waiting as u64;
-                account.used += unit.waiting as u64;
+                let waiting = units.waiting.count(index) as u64;
+                account.pending -= waiting;
+                account.used += waiting;
             }
         }
         units.take()
@@ -164,14 +154,13 @@ impl Books {
 
     /// The recording of `units` ends: waiting batches came after its last set.
     pub(super) fn end(&mut self, units: &mut Units) {
-        for unit in &mut units.units {
-            let left = core::mem::take(&mut unit.waiting) as u64;
+        for (index, unit) in units.units.iter().enumerate() {
+            let left = units.waiting.take(index).count() as u64;
             if let Some(account) = self.0.get_mut(&unit.stream.id) {
                 account.pending -= left;
                 account.decimated += left;
             }
         }
-        units.waiting.clear();
     }
 
     /// The accounts, unit by unit.

@@ -248,11 +248,13 @@ impl Control for Inner {
                 field.clone_from(original);
             }
         }
+        let signals = sources.signals().to_vec();
         drop(sources);
         *lock(&self.clock) = pair;
         // As fast as possible is as fast as the disk takes it; then a second of the original takes this much.
         let sets_hz = self.nominal_hz() * lock(&self.transport).rate();
-        let begun = Begun::new(&self.config, &request, self.stream_facts(), sets_hz, &self.outside)?;
+        let streams = self.stream_facts();
+        let begun = Begun::new(&self.config, &request, streams, signals, sets_hz, &self.outside)?;
         Ok(lock(&self.recording).begin(begun))
     }
 

@@ -1,5 +1,6 @@
 //! The replay thread: reads moments, waits until they are due, publishes and records them.
 
+use super::signals::Outputs;
 use super::source::Moment;
 use super::transport::Order;
 use super::{Inner, lock};
@@ -7,7 +8,7 @@ use crate::Result;
 use crate::stream::Stream;
 use core::time::Duration;
 use depthrig_bus::{
-    Bus, DropReason, ErrorKind, FrameFlags, FrameHeader, HostTime, MemberRecord, Publisher,
+    Bus, DropReason, ErrorKind, FrameFlags, FrameHeader, HostTime, MemberRecord, Publisher, RuntimeDir,
     SUBSCRIBER_BUFFER, SetHeader, SetPublisher, UtcPair, shm,
 };
 use depthrig_recorder::{PixelMode, Pixels, RecordFrame, RecordMotion, RecordSet};
@@ -31,6 +32,7 @@ pub struct Player {
     units: Vec<Output>,
     /// Batches that were published, and go into the next set that is recorded.
     carried: Vec<RecordMotion>,
+    signals: Outputs,
     sets: SetPublisher,
 }
 
@@ -61,7 +63,7 @@ impl Player {
     ///
     /// # Errors
     /// `NoSpace` when shared memory is too small, and those of opening a channel.
-    pub fn new(inner: Arc<Inner>, bus: Arc<Bus>) -> Result<Self> {
+    pub fn new(inner: Arc<Inner>, bus: Arc<Bus>, runtime: &RuntimeDir) -> Result<Self> {
         let bytes = |s: &Stream| s.profile.frame_bytes();
         let set_bytes = inner.streams.iter().chain(&inner.unit_streams).map(|s| bytes(s) as u64).sum();
         let free = shm::free_bytes(shm::SHM_DIR.as_ref())?;
@@ -74,7 +76,8 @@ impl Player {
         let units = inner.unit_streams.iter().map(open).collect::<Result<_>>()?;
         let sets =
             if inner.lossless() { bus.set_publisher_with(SUBSCRIBER_BUFFER)? } else { bus.set_publisher()? };
-        Ok(Self { inner, bus, outputs, units, carried: Vec::new(), sets })
+        let signals = Outputs::open(&inner, runtime, lock(&inner.sources).signals())?;
+        Ok(Self { inner, bus, outputs, units, carried: Vec::new(), signals, sets })
     }
 
     /// Runs until the replay is stopped. The channels stay until then, so that subscribers can read the last frames.
@@ -110,6 +113,7 @@ impl Player {
     fn idle(&self, length: Duration) {
         self.inner.wake.wait(length);
         self.outputs.iter().chain(&self.units).for_each(|o| o.publisher.welcome());
+        self.signals.welcome();
         self.sets.welcome();
     }
 
@@ -117,6 +121,8 @@ impl Player {
         for problem in std::mem::take(&mut moment.problems) {
             self.inner.lose(problem);
         }
+        let is_recording = lock(&self.inner.recording).is_active();
+        self.signals.publish(&self.inner, std::mem::take(&mut moment.signals), is_recording);
         if !self.publish_motion(&mut moment) || moment.frames.is_empty() {
             return;
         }
@@ -196,6 +202,7 @@ impl Player {
     fn record(&mut self, id: u64, moment: &Moment, frames: Vec<RecordFrame>) {
         let inner = Arc::clone(&self.inner);
         let motion = std::mem::take(&mut self.carried);
+        let signals = self.signals.take();
         while !lock(&inner.recording).has_room() && !inner.stopping() {
             std::thread::sleep(ASK);
         }
@@ -206,7 +213,7 @@ impl Player {
         *lock(&inner.clock) = utc;
         let tick = moment.tick;
         let spread_ns = moment.spread_ns;
-        lock(&inner.recording).push(RecordSet { id, tick, utc, frames, missing, motion, spread_ns });
+        lock(&inner.recording).push(RecordSet { id, tick, utc, frames, missing, motion, signals, spread_ns });
     }
 }
 

@@ -1,11 +1,12 @@
 //! Where replayed sets come from: one or several datasets, read as the sets of one rig.
 
+use super::signals::shifted;
 use super::timeline::{Part, Timeline};
 use crate::{Error, ErrorKind, Result};
 use depthrig_bus::{FrameHeader, HostTime, PixelFormat, RigName};
 use depthrig_recorder::{
     ColorCodec, Computed, Dataset, DatasetFrame, DatasetSet, DepthCodec, MotionRecord, PixelMode,
-    RecordMotion, Session, SetReader, StreamRecord,
+    RecordMotion, RecordSignal, Session, SetReader, SignalRecord, StreamRecord,
 };
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -22,6 +23,7 @@ pub struct Sources {
     rig: RigName,
     streams: Vec<StreamRecord>,
     units: Vec<MotionRecord>,
+    signals: Vec<SignalRecord>,
     /// Added to a monotonic time of the replay this gives UTC.
     utc_offset_ns: i64,
 }
@@ -34,6 +36,8 @@ struct Source {
     /// The rig's IMU of each of this dataset; `None` where a dataset before it gives the same unit at the same
     /// times, as a recording and a dataset computed from it do.
     units: Vec<Option<usize>>,
+    /// The same of its signals; also `None` where another dataset has other fields by that name.
+    signals: Vec<Option<usize>>,
 }
 
 /// One moment of a replay: a set, or several that were paired.
@@ -49,6 +53,8 @@ pub struct Moment {
     pub frames: Vec<DatasetFrame>,
     /// IMU batches since the moment before; `unit` is the rig's IMU.
     pub motion: Vec<RecordMotion>,
+    /// Samples of signals since the moment before; `signal` is the rig's signal.
+    pub signals: Vec<RecordSignal>,
     /// Sets of this moment that could not be read.
     pub problems: Vec<String>,
 }
@@ -63,6 +69,7 @@ impl Sources {
         let mut sources = Vec::new();
         let mut streams: Vec<StreamRecord> = Vec::new();
         let mut units: Vec<MotionRecord> = Vec::new();
+        let mut signals: Vec<SignalRecord> = Vec::new();
         for path in paths {
             let dataset = Dataset::open(path).map_err(Error::from)?;
             let reader = dataset.set_reader().map_err(Error::from)?;
@@ -84,7 +91,14 @@ impl Sources {
                 .collect();
             let mut unit = |record| Some(join_unit(&mut units, record)).filter(|i| !given.contains(i));
             let of_rig = dataset.session().motion.iter().map(&mut unit).collect();
-            sources.push(Source { dataset, reader, streams: indices, units: of_rig });
+            let given: BTreeSet<usize> = sources
+                .iter()
+                .filter(|s| overlaps(s))
+                .flat_map(|s| s.signals.iter().flatten().copied())
+                .collect();
+            let mut signal = |record| join_signal(&mut signals, record).filter(|i| !given.contains(i));
+            let signals = dataset.session().signals.iter().map(&mut signal).collect();
+            sources.push(Source { dataset, reader, streams: indices, units: of_rig, signals });
         }
         if sources.is_empty() {
             return Err(bad("name a dataset to replay"));
@@ -94,7 +108,7 @@ impl Sources {
             Some(rig) => rig,
             None => rig_of(&sources)?,
         };
-        Ok(Self { list: sources, rig, streams, units, utc_offset_ns })
+        Ok(Self { list: sources, rig, streams, units, signals, utc_offset_ns })
     }
 
     /// The moments of a replay of them.
@@ -127,6 +141,11 @@ impl Sources {
     /// The IMUs of all of them.
     pub fn units(&self) -> &[MotionRecord] {
         &self.units
+    }
+
+    /// The signals of all of them.
+    pub fn signals(&self) -> &[SignalRecord] {
+        &self.signals
     }
 
     /// The algorithms behind the streams that no camera gave.
@@ -180,7 +199,7 @@ impl Sources {
             match source.reader.read(member.set as usize, mode) {
                 Ok(set) => {
                     let shift_ns = shift(set.utc_offset_ns, self.utc_offset_ns);
-                    take(&mut read, set, &source.streams, &source.units, shift_ns, sets == 0);
+                    take(&mut read, set, source, shift_ns, sets == 0);
                     sets += 1;
                 }
                 Err(e) => read.problems.push(e.to_string()),
@@ -256,6 +275,15 @@ fn join_unit(units: &mut Vec<MotionRecord>, record: &MotionRecord) -> usize {
     units.len() - 1
 }
 
+/// The rig's signal for `record`; a new one unless a dataset before it has it. `None` if that one has other fields.
+fn join_signal(signals: &mut Vec<SignalRecord>, record: &SignalRecord) -> Option<usize> {
+    if let Some(i) = signals.iter().position(|s| s.id == record.id) {
+        return (signals[i] == *record).then_some(i);
+    }
+    signals.push(record.clone());
+    Some(signals.len() - 1)
+}
+
 /// From the clock of the replay, which is that of the first set that can be read, to UTC; 0 where none can.
 fn utc_offset_ns(sources: &mut [Source]) -> Result<i64> {
     for source in sources {
@@ -297,14 +325,7 @@ fn overlap(a: &[i64], b: &[i64]) -> bool {
 }
 
 /// Adds a set to a moment.
-fn take(
-    moment: &mut Moment,
-    set: DatasetSet,
-    streams: &[usize],
-    units: &[Option<usize>],
-    shift_ns: i64,
-    first: bool,
-) {
+fn take(moment: &mut Moment, set: DatasetSet, source: &Source, shift_ns: i64, first: bool) {
     let move_header = |h: &mut FrameHeader| {
         for t in [&mut h.capture_time_ns, &mut h.arrival_time_ns, &mut h.publish_time_ns] {
             *t = t.saturating_add(shift_ns);
@@ -316,17 +337,22 @@ fn take(
     }
     moment.tick = moment.tick.min(tick);
     for mut frame in set.frames {
-        let Some(stream) = streams.get(frame.stream) else { continue };
+        let Some(stream) = source.streams.get(frame.stream) else { continue };
         frame.stream = *stream;
         move_header(&mut frame.header);
         moment.frames.push(frame);
     }
     for mut batch in set.motion {
-        let Some(unit) = units.get(batch.unit).copied().flatten() else { continue };
+        let Some(unit) = source.units.get(batch.unit).copied().flatten() else { continue };
         batch.unit = unit;
         move_header(&mut batch.header);
         batch.samples.iter_mut().for_each(|s| s.time_ns = s.time_ns.saturating_add(shift_ns));
         moment.motion.push(batch);
+    }
+    for part in set.signals {
+        let Some(signal) = source.signals.get(part.signal).copied().flatten() else { continue };
+        let samples = part.samples.iter().filter_map(|s| shifted(s, shift_ns)).collect();
+        moment.signals.push(RecordSignal { signal, samples });
     }
 }
 

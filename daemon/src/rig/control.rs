@@ -77,7 +77,9 @@ impl Control for Inner {
         self.must_be_drawn()?;
         let sets_hz = self.config.sets.rate_hz;
         // Without the recording's lock: making a file must not keep the set thread waiting.
-        let begun = Begun::new(&self.config, request, self.stream_facts(), sets_hz, &self.outside)?;
+        let signals = self.recording().signals();
+        let streams = self.stream_facts();
+        let begun = Begun::new(&self.config, request, streams, signals, sets_hz, &self.outside)?;
         let status = self.recording().begin(begun);
         if let Some(note) = controls::note(self)
             && let Err(e) = self.recording().note(&note)

@@ -32,6 +32,7 @@ from ._sets import FrameSet, Sets
 from ._signal import Signal, signals
 from ._signal_description import SignalDescription, SignalField
 from ._signal_reader import SignalReader
+from ._signal_recorded import recorded_signal
 from ._signal_sample import SignalSample, SignalWindow
 from ._stream import Stream, streams
 from .errors import (
@@ -113,6 +114,7 @@ __all__ = [
     "StreamNotFound",
     "Timeout",
     "VersionMismatch",
+    "recorded_signal",
     "running_rigs",
     "signals",
     "streams",

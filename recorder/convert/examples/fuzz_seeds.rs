@@ -87,6 +87,7 @@ fn set(session: &Session, n: u64, missing: Option<usize>) -> RecordSet {
         tick: HostTime::from_ns(tick),
         utc: UtcPair { mono: HostTime::from_ns(MONO_NS), utc_ns: UTC_NS, width_ns: 200 },
         motion: (0..session.motion.len()).map(|unit| batch(session, unit, n)).collect(),
+        signals: Vec::new(),
         spread_ns: 0,
         missing: missing.into_iter().collect(),
         frames: frames.collect(),

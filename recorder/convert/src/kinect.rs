@@ -294,6 +294,7 @@ impl KinectImport {
             utc: UtcPair::default(),
             missing,
             motion: Vec::new(),
+            signals: Vec::new(),
             spread_ns: times().max().unwrap_or(0).saturating_sub(first),
             frames,
         }

@@ -195,6 +195,7 @@ mod tests {
             frames: Vec::new(),
             missing: Vec::new(),
             motion: Vec::new(),
+            signals: Vec::new(),
         };
         let row = FrameRow::new("a/b".into(), &set, &frame, Some("a/b/000014.png".into()));
         let json = serde_json::to_value(&row).unwrap();

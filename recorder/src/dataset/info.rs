@@ -1,12 +1,13 @@
 //! Content of a dataset, without reading an image.
 
-use super::{Dataset, PixelMode, SetRange};
+use super::{Dataset, PixelMode, SetRange, SignalCount};
 use crate::container::scan::{ChunkEntry, SegmentReader};
 use crate::msgs::accounts;
 use crate::msgs::schemas::Schema;
 use crate::session::calibration_date;
 use crate::{
-    Computed, Edit, ErrorKind, MotionRecord, RecordMotion, Result, SetCounts, StreamAccount, StreamRecord,
+    Computed, Edit, ErrorKind, MotionRecord, RecordMotion, Result, SetCounts, SignalRecord, StreamAccount,
+    StreamRecord,
 };
 use depthrig_bus::FrameFlags;
 use serde::Serialize;
@@ -52,6 +53,9 @@ pub struct DatasetInfo {
     /// Per IMU.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub motion: Vec<MotionInfo>,
+    /// Per signal.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub signals: Vec<SignalInfo>,
     /// Streams that no camera gave, with what computed them.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub computed: Vec<Computed>,
@@ -166,6 +170,26 @@ pub struct MotionInfo {
     pub rate_hz: f64,
 }
 
+/// One signal of a dataset.
+#[derive(Debug, Clone, Serialize)]
+#[non_exhaustive]
+pub struct SignalInfo {
+    /// `device/signal`.
+    pub signal: String,
+    /// `fields`, `joints` or `pose`.
+    pub kind: &'static str,
+    /// Names of its fields.
+    pub fields: Vec<String>,
+    /// Samples in the dataset.
+    pub samples: u64,
+    /// Samples between the first and the last that are not in it.
+    pub lost: u64,
+    /// Number of times that another publisher took over.
+    pub restarts: u64,
+    /// Samples per second between the first and the last, by their times.
+    pub rate_hz: f64,
+}
+
 /// Counts of an IMU while its batches are read.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct MotionCount {
@@ -251,6 +275,21 @@ impl MotionInfo {
     }
 }
 
+impl SignalInfo {
+    fn new(signal: &SignalRecord, count: &SignalCount) -> Self {
+        let description = &signal.description;
+        Self {
+            signal: signal.id.to_string(),
+            kind: description.kind().name(),
+            fields: description.all_fields().iter().map(|f| f.name.clone()).collect(),
+            samples: count.samples,
+            lost: count.lost,
+            restarts: count.restarts,
+            rate_hz: count.rate_hz(),
+        }
+    }
+}
+
 pub(super) fn gather(dataset: &Dataset) -> Result<DatasetInfo> {
     let session = dataset.session();
     let mut info = DatasetInfo {
@@ -271,6 +310,7 @@ pub(super) fn gather(dataset: &Dataset) -> Result<DatasetInfo> {
         spread: SpreadStats::default(),
         streams: Vec::new(),
         motion: Vec::new(),
+        signals: Vec::new(),
         computed: session.computed.clone(),
         calibration: AttachedCalibration::of(session),
         history: session.history.clone(),
@@ -281,6 +321,7 @@ pub(super) fn gather(dataset: &Dataset) -> Result<DatasetInfo> {
     let mut spreads = Vec::new();
     let mut ticks = None;
     let mut units = vec![MotionCount::default(); session.motion.len()];
+    let mut signals = vec![SignalCount::default(); session.signals.len()];
     let mut captures = vec![None; info.streams.len()];
     for set in dataset.sets_with(SetRange::ALL, PixelMode::None) {
         let set = match set {
@@ -298,6 +339,9 @@ pub(super) fn gather(dataset: &Dataset) -> Result<DatasetInfo> {
         ticks = Some((first, set.tick));
         for batch in &set.motion {
             units[batch.unit].take(batch);
+        }
+        for part in &set.signals {
+            signals[part.signal].take(&part.samples);
         }
         for s in set.missing {
             info.streams[s].missing += 1;
@@ -320,6 +364,7 @@ pub(super) fn gather(dataset: &Dataset) -> Result<DatasetInfo> {
         }
     }
     info.motion = session.motion.iter().zip(&units).map(|(u, count)| MotionInfo::new(u, count)).collect();
+    info.signals = session.signals.iter().zip(&signals).map(|(s, count)| SignalInfo::new(s, count)).collect();
     info.spread = SpreadStats::of(spreads);
     info.duration_ns = ticks.map_or(0, |(first, last)| last.since_ns(first));
     for i in 0..dataset.segments().len() {

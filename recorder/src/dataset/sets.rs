@@ -3,10 +3,11 @@
 use super::{Dataset, PixelFilter, decode};
 use crate::container::scan::{ChannelInfo, ChunkEntry, SegmentReader};
 use crate::encode::Codec;
+use crate::frame::Waiting;
 use crate::msgs::frame_set::FrameSetMsg;
 use crate::msgs::schemas::Schema;
-use crate::msgs::{frame_info, motion};
-use crate::{Error, ErrorKind, RecordMotion, Result, SET_MOTION_MAX_BYTES};
+use crate::msgs::{frame_info, motion, signal};
+use crate::{Error, ErrorKind, RecordMotion, RecordSignal, Result};
 use depthrig_bus::{FrameHeader, HostTime, PixelFormat, StreamId};
 use std::collections::{BTreeMap, VecDeque};
 use std::ops::{Bound, RangeBounds};
@@ -80,6 +81,8 @@ pub struct DatasetSet {
     pub missing: Vec<usize>,
     /// IMU batches since the set before.
     pub motion: Vec<RecordMotion>,
+    /// Samples of signals since the set before.
+    pub signals: Vec<RecordSignal>,
 }
 
 /// A frame read from a dataset.
@@ -150,13 +153,21 @@ pub(crate) enum Kind {
     Samples(StreamId),
     /// A sample, for readers that do not know batches.
     Imu(StreamId),
+    /// Samples of a signal.
+    Signal(StreamId),
+    /// A sample of a signal, for readers that know only ROS.
+    SignalSingle(StreamId),
     Set,
 }
 
 impl Kind {
-    /// Whether it is of an IMU.
-    pub(crate) const fn is_motion(&self) -> bool {
-        matches!(self, Self::UnitInfo(_) | Self::Samples(_) | Self::Imu(_))
+    /// Counts a message of an IMU or a signal of `bytes`; the error in words if a set has too many.
+    pub(crate) fn count(&self, waiting: &mut Waiting, bytes: usize) -> core::result::Result<(), String> {
+        match self {
+            Self::UnitInfo(_) | Self::Samples(_) | Self::Imu(_) => waiting.motion(bytes),
+            Self::Signal(_) | Self::SignalSingle(_) => waiting.signal(bytes),
+            Self::Image(_) | Self::Info(_) | Self::Set => Ok(()),
+        }
     }
 }
 
@@ -166,8 +177,9 @@ struct Partial {
     images: BTreeMap<StreamId, (u64, Vec<u8>)>,
     infos: BTreeMap<StreamId, (u64, Vec<u8>)>,
     batches: Vec<PartialBatch>,
-    /// Bytes of these.
-    motion_bytes: u64,
+    /// Samples of signals, each with its log time.
+    signals: Vec<(StreamId, u64, Vec<u8>)>,
+    waiting: Waiting,
 }
 
 /// A batch of an IMU, as far as it was read.
@@ -266,14 +278,9 @@ impl Open {
         let Self { reader, kinds, partial, .. } = self;
         reader.messages(entry, |m| {
             let kind = kinds.get(&m.channel);
-            if kind.is_some_and(Kind::is_motion) {
-                partial.motion_bytes = partial.motion_bytes.saturating_add(m.data.len() as u64);
-                if partial.motion_bytes > SET_MOTION_MAX_BYTES {
-                    *partial = Partial::default();
-                    let what =
-                        format!("a set has more than {SET_MOTION_MAX_BYTES} bytes of motion before its mark");
-                    return Err(reader.error(ErrorKind::Corrupt, entry.offset, what));
-                }
+            if let Some(Err(what)) = kind.map(|kind| kind.count(&mut partial.waiting, m.data.len())) {
+                *partial = Partial::default();
+                return Err(reader.error(ErrorKind::Corrupt, entry.offset, what));
             }
             match kind {
                 Some(Kind::Image(id)) if mode != PixelMode::None => {
@@ -294,6 +301,9 @@ impl Open {
                     if let Some(last) = last.filter(|b| b.samples.is_none() && b.log_time == m.log_time) {
                         last.samples = Some(m.data.to_vec());
                     }
+                }
+                Some(Kind::Signal(id)) => {
+                    partial.signals.push((id.clone(), m.log_time, m.data.to_vec()));
                 }
                 Some(Kind::Set) => {
                     let partial = std::mem::take(partial);
@@ -370,6 +380,8 @@ fn assemble(
     }
     let batches = partial.batches.into_iter().filter(|b| b.log_time == log_time);
     let motion = batches.map(|b| batch(b, set.id, dataset)).collect::<Result<_>>()?;
+    let samples = partial.signals.into_iter().filter(|(_, t, _)| *t == log_time);
+    let signals = samples.map(|(id, _, m)| signal_part(&id, &m, set.id, dataset)).collect::<Result<_>>()?;
     Ok(DatasetSet {
         id: set.id,
         tick: HostTime::from_ns(set.tick_ns),
@@ -379,7 +391,18 @@ fn assemble(
         frames,
         missing: set.missing.iter().map(|name| index(name)).collect::<Result<_>>()?,
         motion,
+        signals,
     })
+}
+
+/// Samples of a signal in set `set`, restored.
+fn signal_part(id: &StreamId, message: &[u8], set: u64, dataset: &Dataset) -> Result<RecordSignal> {
+    let signals = &dataset.session().signals;
+    let signal = signals.iter().position(|s| s.id == *id).ok_or_else(|| {
+        Error::new(ErrorKind::Corrupt, format!("set {set}: {id} is not a signal of the session"))
+    })?;
+    let samples = signal::read_samples(message, &signals[signal].description)?.samples;
+    Ok(RecordSignal { signal, samples })
 }
 
 /// A batch of set `set`, restored.
@@ -423,6 +446,12 @@ pub(crate) fn kind_of(channel: &ChannelInfo) -> Option<Kind> {
     }
     if is(Schema::Imu) {
         return Some(Kind::Imu(stream));
+    }
+    if is(Schema::SignalSamples) {
+        return Some(Kind::Signal(stream));
+    }
+    if [Schema::JointState, Schema::PoseStamped, Schema::SignalValues].into_iter().any(is) {
+        return Some(Kind::SignalSingle(stream));
     }
     Schema::IMAGES.into_iter().any(is).then_some(Kind::Image(stream))
 }

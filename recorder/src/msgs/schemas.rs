@@ -23,10 +23,14 @@ pub(crate) enum Schema {
     CompressedDepth,
     MotionSamples,
     Imu,
+    SignalSamples,
+    JointState,
+    PoseStamped,
+    SignalValues,
 }
 
 impl Schema {
-    pub(crate) const ALL: [Self; 14] = [
+    pub(crate) const ALL: [Self; 18] = [
         Self::Image,
         Self::CompressedImage,
         Self::CameraInfo,
@@ -41,6 +45,10 @@ impl Schema {
         Self::CompressedDepth,
         Self::MotionSamples,
         Self::Imu,
+        Self::SignalSamples,
+        Self::JointState,
+        Self::PoseStamped,
+        Self::SignalValues,
     ];
 
     /// The types that carry an image.
@@ -48,6 +56,9 @@ impl Schema {
 
     /// The types that only a dataset with an IMU has.
     const MOTION: [Self; 2] = [Self::MotionSamples, Self::Imu];
+
+    /// The types that only a segment with signals has.
+    const SIGNALS: [Self; 4] = [Self::SignalSamples, Self::JointState, Self::PoseStamped, Self::SignalValues];
 
     /// The id of the schema record: 1, 2, … in the order of [`Self::ALL`].
     pub(crate) const fn id(self) -> u16 {
@@ -70,6 +81,10 @@ impl Schema {
             Self::CompressedDepth => "depthrig_msgs/msg/CompressedDepth",
             Self::MotionSamples => "depthrig_msgs/msg/MotionSamples",
             Self::Imu => "sensor_msgs/msg/Imu",
+            Self::SignalSamples => "depthrig_msgs/msg/SignalSamples",
+            Self::JointState => "sensor_msgs/msg/JointState",
+            Self::PoseStamped => "geometry_msgs/msg/PoseStamped",
+            Self::SignalValues => "depthrig_msgs/msg/SignalValues",
         }
     }
 
@@ -96,18 +111,27 @@ impl Schema {
             Self::CompressedDepth => with(COMPRESSED_DEPTH, &[HEADER_DEP, TIME_DEP]),
             Self::MotionSamples => with(MOTION_SAMPLES, &[TIME_DEP, (MOTION_SAMPLE, &motion_sample())]),
             Self::Imu => with(IMU, &[HEADER_DEP, TIME_DEP, QUATERNION_DEP, VECTOR3_DEP]),
+            Self::SignalSamples => with(SIGNAL_SAMPLES, &[TIME_DEP, SIGNAL_SAMPLE_DEP]),
+            Self::JointState => with(JOINT_STATE, &[HEADER_DEP, TIME_DEP]),
+            Self::PoseStamped => with(
+                "std_msgs/Header header\ngeometry_msgs/Pose pose\n",
+                &[HEADER_DEP, TIME_DEP, POSE_DEP, POINT_DEP, QUATERNION_DEP],
+            ),
+            Self::SignalValues => with(SIGNAL_VALUES, &[HEADER_DEP, TIME_DEP, SIGNAL_VALUE_DEP]),
         }
     }
 
-    /// The records of all types, as they stand at the head of a segment of a recording that has IMUs or not.
-    pub(crate) fn records(motion: bool) -> Vec<SchemaRecord> {
+    /// The records of all types, as they stand at the head of a segment that has IMUs or not, signals or not.
+    pub(crate) fn records(motion: bool, signals: bool) -> Vec<SchemaRecord> {
         let record = |s: Self| SchemaRecord {
             id: s.id(),
             name: s.name().to_owned(),
             encoding: "ros2msg".to_owned(),
             data: s.text().into_bytes(),
         };
-        Self::ALL.into_iter().filter(|s| motion || !Self::MOTION.contains(s)).map(record).collect()
+        let is_there =
+            |s: &Self| (motion || !Self::MOTION.contains(s)) && (signals || !Self::SIGNALS.contains(s));
+        Self::ALL.into_iter().filter(is_there).map(record).collect()
     }
 }
 
@@ -138,6 +162,9 @@ const TRANSFORM_STAMPED_DEP: Dep<'_> = (
     "geometry_msgs/TransformStamped",
     "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform\n",
 );
+const POINT_DEP: Dep<'_> = ("geometry_msgs/Point", "float64 x\nfloat64 y\nfloat64 z\n");
+const POSE_DEP: Dep<'_> =
+    ("geometry_msgs/Pose", "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n");
 const KEY_VALUE_DEP: Dep<'_> = ("diagnostic_msgs/KeyValue", "string key\nstring value\n");
 const STATUS_DEP: Dep<'_> = (
     "diagnostic_msgs/DiagnosticStatus",
@@ -282,6 +309,46 @@ float64[9] angular_velocity_covariance
 geometry_msgs/Vector3 linear_acceleration
 float64[9] linear_acceleration_covariance
 ";
+
+const SIGNAL_SAMPLES: &str = "\
+# Samples of a signal, oldest first, all of one publisher: session is when it began, on the host's monotonic clock.
+# stamp is the time of the newest as UTC. The channel's metadata description, JSON, names the fields of the values.
+builtin_interfaces/Time stamp
+uint64 session
+depthrig_msgs/SignalSample[] samples
+";
+
+const SIGNAL_SAMPLE_DEP: Dep<'_> = (
+    "depthrig_msgs/SignalSample",
+    "# Number of the sample of its publisher: 1, 2, 3, ... A gap is samples that were not recorded.\n\
+     uint64 sequence\n\
+     # Nanoseconds of the host's monotonic clock: when the values were measured, and when they were published.\n\
+     int64 time_ns\nint64 publish_time_ns\nuint64 uncertainty_ns\n\
+     # 1 replayed, 2 time uncertain, 4 the time is that of publishing.\nuint32 flags\n\
+     # As published: fields in their order, each element aligned to its size, a text last behind its length.\n\
+     uint8[] values\n",
+);
+
+const JOINT_STATE: &str = "\
+std_msgs/Header header
+string[] name
+float64[] position
+float64[] velocity
+float64[] effort
+";
+
+const SIGNAL_VALUES: &str = "\
+# A sample of a signal that is neither joints in SI units nor a pose.
+std_msgs/Header header
+depthrig_msgs/SignalValue[] fields
+";
+
+const SIGNAL_VALUE_DEP: Dep<'_> = (
+    "depthrig_msgs/SignalValue",
+    "string name\n# f64, f32, i64, bool or text.\nstring type\nstring unit\n\
+     # One of the three has the elements: floats of f64 and f32, integers of i64 and bool, text.\n\
+     float64[] floats\nint64[] integers\nstring text\n",
+);
 
 /// The definition of `MotionSample`, from the layout of the sample.
 fn motion_sample() -> String {

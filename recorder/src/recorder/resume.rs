@@ -1,7 +1,7 @@
 //! Reads the finished segments of a recording whose recorder was killed.
 
 use super::RESERVE_FILE;
-use super::topics::SEGMENT_METADATA;
+use super::topics::{SEGMENT_METADATA, SampleNumber};
 use crate::dataset::{Dataset, PixelMode, SetRange, segment_number};
 use crate::fs::Fs;
 use crate::session::SESSION_TMP;
@@ -32,6 +32,8 @@ pub(super) struct Past {
     pub(super) last_id: Option<u64>,
     /// Number of the last batch of each IMU.
     pub(super) last_batches: Vec<Option<u64>>,
+    /// The last sample of each signal.
+    pub(super) last_samples: Vec<Option<SampleNumber>>,
     pub(super) anchor: Option<UtcPair>,
     pub(super) last_log_time: i64,
     pub(super) first_tick: Option<HostTime>,
@@ -43,6 +45,7 @@ impl Past {
     pub(super) fn new(session: Session) -> Self {
         Self {
             last_batches: vec![None; session.motion.len()],
+            last_samples: vec![None; session.signals.len()],
             session,
             segments: 0,
             sets: 0,
@@ -64,6 +67,10 @@ impl Past {
             self.last_id = Some(set.id);
             for batch in &set.motion {
                 self.last_batches[batch.unit] = Some(batch.header.sequence);
+            }
+            for part in &set.signals {
+                let last = part.samples.last().map(|s| (s.header().session, s.header().sequence));
+                self.last_samples[part.signal] = last.or(self.last_samples[part.signal]);
             }
             self.last_log_time = set.utc_ns;
             let offset = set.tick.ns().saturating_add(set.utc_offset_ns);

@@ -6,7 +6,7 @@
 //! would take longer than it has left, and whenever its deadline passes.
 
 use crate::encode::{Effort, EncodedFrame};
-use crate::frame::{RecordFrame, RecordMotion, RecordSet};
+use crate::frame::{RecordFrame, RecordMotion, RecordSet, RecordSignal};
 use crate::{Error, ErrorKind, Result};
 use depthrig_bus::sync::lock;
 use depthrig_bus::{FrameHeader, HostTime, UtcPair};
@@ -51,6 +51,8 @@ pub(super) struct Ticket {
     pub(super) frames: Vec<(usize, FrameHeader)>,
     /// The batches of the IMUs, `set_id` filled in.
     pub(super) motion: Vec<RecordMotion>,
+    /// The samples of the signals.
+    pub(super) signals: Vec<RecordSignal>,
     /// When it is given up.
     pub(super) due: Option<HostTime>,
     pushed: HostTime,
@@ -99,7 +101,8 @@ impl Ticket {
             batch.header.set_id = set.id;
         }
         // Samples wait for the writer as encoded images do.
-        let bytes = motion.iter().map(RecordMotion::stored_bytes).sum();
+        let of_motion: u64 = motion.iter().map(RecordMotion::stored_bytes).sum();
+        let bytes = of_motion + set.signals.iter().map(RecordSignal::stored_bytes).sum::<u64>();
         load.backlog_bytes.fetch_add(bytes, Ordering::Relaxed);
         let done = frames.iter().map(|_| None).collect();
         let ticket = Self {
@@ -116,6 +119,7 @@ impl Ticket {
             slots: Mutex::new(Slots { left: frames.len(), bytes, done, begun: None, given_up: false }),
             frames: frames.iter().map(|f| (f.stream, f.header)).collect(),
             motion,
+            signals: set.signals,
             ready: Condvar::new(),
             load: Arc::clone(load),
         };

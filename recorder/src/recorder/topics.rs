@@ -3,11 +3,12 @@
 use crate::container::record::Channel;
 use crate::container::segment::Preamble;
 use crate::encode::Codec;
-use crate::frame::{RecordMotion, RecordSet, SET_MOTION_MAX_BYTES};
+use crate::frame::{RecordMotion, RecordSet, RecordSignal, SET_MOTION_MAX_BYTES, SET_SIGNALS_MAX_BYTES};
 use crate::msgs::image;
 use crate::msgs::schemas::Schema;
+use crate::msgs::signal::SignalForm;
 use crate::msgs::tf::{mount_frame, optical_frame, unit_frame};
-use crate::{IMAGE_MAX_BYTES, MotionRecord, RecorderOptions, Result, Session};
+use crate::{IMAGE_MAX_BYTES, MotionRecord, RecorderOptions, Result, Session, SignalRecord};
 use depthrig_bus::{FrameHeader, MOTION_SAMPLE_BYTES, PixelFormat};
 use std::collections::BTreeMap;
 
@@ -82,6 +83,15 @@ const fn motion_channel(streams: usize, unit: usize) -> u16 {
     image_channel(streams) + 3 * unit as u16
 }
 
+/// The samples of the signal of this index; its single samples follow. Signals come last, so that one which appears while
+/// a recording goes on moves no other channel.
+pub(crate) const fn signal_channel(streams: usize, units: usize, signal: usize) -> u16 {
+    motion_channel(streams, units) + 2 * signal as u16
+}
+
+/// The number of the last sample of a signal: its publisher's session and its place there.
+pub(crate) type SampleNumber = (u64, u64);
+
 /// An IMU.
 pub(crate) struct Unit {
     name: String,
@@ -122,6 +132,11 @@ impl Topics {
 
     pub(crate) fn unit(&self, unit: usize) -> &Unit {
         &self.units[unit]
+    }
+
+    /// The channel of the samples of a signal; that of its single ones follows.
+    pub(super) fn signal_channel(&self, signal: usize) -> u16 {
+        signal_channel(self.names.len(), self.units.len(), signal)
     }
 
     pub(crate) fn frame_id(&self, stream: usize) -> &str {
@@ -194,6 +209,43 @@ impl Topics {
         Ok(())
     }
 
+    /// Checks the samples of a set of these signals, after these of each; the error in words.
+    pub(super) fn check_signals(
+        signals: &[RecordSignal],
+        known: &[SignalRecord],
+        last: &[Option<SampleNumber>],
+    ) -> Result<(), String> {
+        let mut last = last.to_vec();
+        last.resize(known.len(), None);
+        let mut bytes = 0_u64;
+        for part in signals {
+            let Some((record, last)) = known.get(part.signal).zip(last.get_mut(part.signal)) else {
+                return Err(format!("signal number {} is not in the session", part.signal));
+            };
+            let session = part.samples.first().map(|s| s.header().session);
+            for sample in &part.samples {
+                let h = sample.header();
+                let number = (h.session, h.sequence);
+                let what = if sample.description() != &record.description {
+                    "has other fields than the session says"
+                } else if Some(h.session) != session {
+                    "is of another publisher than those before it"
+                } else if last.is_some_and(|last| number <= last) {
+                    "does not follow the one before it"
+                } else {
+                    *last = Some(number);
+                    continue;
+                };
+                return Err(format!("sample {} of signal {} {what}", h.sequence, record.id));
+            }
+            bytes = bytes.saturating_add(part.stored_bytes());
+        }
+        if bytes > SET_SIGNALS_MAX_BYTES {
+            return Err(format!("its signals take {bytes} bytes, {SET_SIGNALS_MAX_BYTES} is the limit"));
+        }
+        Ok(())
+    }
+
     /// Everything that a segment says before its first chunk.
     pub(crate) fn preamble(&self, session: &Session, segment: u32) -> Result<Preamble> {
         let rig = &session.rig;
@@ -251,6 +303,9 @@ impl Topics {
         for (unit, u) in session.motion.iter().zip(&self.units) {
             channels.extend(unit_channels(rig, unit, u));
         }
+        for (i, signal) in session.signals.iter().enumerate() {
+            channels.extend(signal_channels(rig, signal, self.signal_channel(i)));
+        }
         let facts = [
             ("format", session.format.clone()),
             ("name", session.name.clone()),
@@ -266,7 +321,7 @@ impl Topics {
         let time = u64::try_from(session.started_utc_ns).unwrap_or(0);
         let config = session.rig_config.clone().into_bytes();
         Ok(Preamble {
-            schemas: Schema::records(!session.motion.is_empty()),
+            schemas: Schema::records(!session.motion.is_empty(), !session.signals.is_empty()),
             channels,
             metadata: vec![(SESSION_METADATA.to_owned(), facts.map(|(k, v)| (k.to_owned(), v)).into())],
             attachments: vec![(time, RIG_ATTACHMENT.to_owned(), "application/toml".to_owned(), config)],
@@ -318,6 +373,28 @@ fn unit_channels(rig: &str, unit: &MotionRecord, u: &Unit) -> [Channel; 3] {
         id += 1;
         channel
     })
+}
+
+/// The two channels of a signal.
+fn signal_channels(rig: &str, signal: &SignalRecord, id: u16) -> [Channel; 2] {
+    let description = &signal.description;
+    let form = SignalForm::of(description);
+    let facts = [
+        ("stream", signal.id.to_string()),
+        ("kind", description.kind().name().to_owned()),
+        ("frame_id", description.frame().to_owned()),
+        ("description", description.json().to_owned()),
+    ];
+    let mut metadata: BTreeMap<_, _> = facts.map(|(k, v)| (k.to_owned(), v)).into();
+    metadata.extend([qos(false)]);
+    let topic = |name| format!("/{rig}/{}/{}/{name}", signal.id.camera, signal.id.stream);
+    let channel = |id, schema: Schema, name| Channel {
+        id,
+        schema: schema.id(),
+        topic: topic(name),
+        metadata: metadata.clone(),
+    };
+    [channel(id, Schema::SignalSamples, "samples"), channel(id + 1, form.schema(), form.topic())]
 }
 
 /// The QoS profile that profile `ros2` demands, as rosbag2 writes it: keep the last ten, reliable, volatile;

@@ -10,6 +10,7 @@ use crate::frame::SetDrop;
 use crate::msgs::frame_info::{self, Extra};
 use crate::msgs::frame_set::{self, Checkpoint, FrameSetMsg, Member};
 use crate::msgs::motion::{self, Imu};
+use crate::msgs::signal::{self, SignalForm};
 use crate::msgs::{accounts, diagnostics, image, tf};
 use crate::{Error, Outcome, Result};
 use core::time::Duration;
@@ -45,6 +46,8 @@ pub(super) struct Writer {
     /// The sets in the present segment, once it has its head chunk.
     in_segment: Option<Within>,
     builder: ChunkBuilder,
+    /// Signals that the present segment names.
+    signals: usize,
     sequence: u32,
     last_log_time: Option<i64>,
     next_sync: HostTime,
@@ -72,7 +75,10 @@ impl Writer {
         segment: Segment,
         index: u32,
     ) -> Self {
-        shared.lock().bytes += segment.len();
+        let mut state = shared.lock();
+        state.bytes += segment.len();
+        let signals = state.session.signals.len();
+        drop(state);
         let now = HostTime::now();
         let next_sync = now.plus_ns(shared.options.sync_interval_ns);
         Self {
@@ -82,6 +88,7 @@ impl Writer {
             index,
             in_segment: None,
             builder: ChunkBuilder::new(),
+            signals,
             sequence: 0,
             last_log_time: None,
             next_sync,
@@ -209,8 +216,13 @@ impl Writer {
                 && (s.len() >= options.segment_max_bytes
                     || ticket.log_time.saturating_sub(began) >= options.segment_max_ns)
         });
-        if full {
+        let unnamed = ticket.signals.iter().any(|s| s.signal >= self.signals);
+        if full || (unnamed && self.segment.is_some()) {
             self.close_segment()?;
+        }
+        if unnamed {
+            // Whoever reads the dataset after a crash finds there all signals of its segments.
+            self.save_session_if_changed();
         }
         let mut chunks = Vec::with_capacity(frames.len() + 2);
         if self.in_segment.is_none() {
@@ -232,6 +244,7 @@ impl Writer {
 
     fn open_segment(&mut self) -> Result<()> {
         let session = self.shared.lock().session.clone();
+        self.signals = session.signals.len();
         let preamble = self.shared.topics.preamble(&session, self.index)?;
         let segment = Segment::create(&*self.shared.fs, &self.shared.dir, self.index, &preamble)?;
         let mut state = self.shared.lock();
@@ -303,6 +316,7 @@ impl Writer {
             });
         }
         self.motion(ticket);
+        self.signals(ticket);
         self.message(Global::FrameSet, ticket.log_time, ticket.log_time, |b| set.write(b));
         self.builder.pack(true)
     }
@@ -329,6 +343,31 @@ impl Writer {
                 let imu = Imu::of(sample, ticket.utc_offset_ns);
                 let head = head(unit.channel + 2, sample.sequence, imu.stamp_utc_ns);
                 self.put(head, |b| imu.write(b, &unit.frame_id));
+            }
+        }
+    }
+
+    /// Writes the samples of signals since the set before: those of a publisher together, then one by one.
+    fn signals(&mut self, ticket: &Ticket) {
+        let shared = Arc::clone(&self.shared);
+        for part in &ticket.signals {
+            let Some(newest) = part.samples.last() else { continue };
+            let form = SignalForm::of(newest.description());
+            let channel = shared.topics.signal_channel(part.signal);
+            let head = |channel, sequence: u64, stamp_utc_ns: i64| MessageHead {
+                channel,
+                sequence: sequence as u32,
+                log_time: ticket.log_time as u64,
+                publish_time: u64::try_from(stamp_utc_ns).unwrap_or(0),
+            };
+            let stamp_utc_ns = ticket.utc_ns(newest.header().time_ns);
+            self.put(head(channel, newest.header().sequence, stamp_utc_ns), |b| {
+                signal::write_samples(b, stamp_utc_ns, &part.samples);
+            });
+            for sample in &part.samples {
+                let h = sample.header();
+                let head = head(channel + 1, h.sequence, ticket.utc_ns(h.time_ns));
+                self.put(head, |b| form.write(b, sample, ticket.utc_offset_ns));
             }
         }
     }

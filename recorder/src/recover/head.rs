@@ -96,7 +96,9 @@ impl HeadSearch<'_> {
         for other in self.segments.iter().filter(|p| *p != self.path) {
             let other = SegmentReader::open_any(self.fs, other)?;
             let Some(mut head) = proven_head(&other)? else { continue };
-            if session_in(&head.preamble, &other).is_some_and(|s| s.has_streams_of(session)) {
+            if session_in(&head.preamble, &other)
+                .is_some_and(|s| s.has_streams_of(session) && s.signals.len() >= session.signals.len())
+            {
                 // What an empty segment says of itself at its end has no chunk before it either.
                 head.preamble.metadata.retain(|(name, _)| name != SEGMENT_METADATA);
                 for (_, map) in head.preamble.metadata.iter_mut().filter(|(name, _)| name == SESSION_METADATA)

@@ -49,6 +49,7 @@ pub(super) fn choose(job: &mut Job<'_>, segments: &[PathBuf]) -> Result<Chosen> 
         stored.rig = said.rig;
         stored.streams = said.streams;
         stored.motion = said.motion;
+        stored.signals = said.signals;
         stored.computed = said.computed;
         job.report.session_rebuilt = true;
         job.report.lost.push(words);

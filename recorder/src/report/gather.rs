@@ -16,6 +16,7 @@ use std::collections::BTreeMap;
 mod images;
 mod messages;
 mod motion;
+mod signal;
 
 /// Bars of the histogram of spreads.
 const BARS: i64 = 48;
@@ -170,6 +171,7 @@ struct Pass {
     t0_ns: i64,
     streams: Vec<Stream>,
     units: Vec<motion::Unit>,
+    signals: Vec<signal::Signal>,
     sets: u64,
     incomplete: u64,
     at: Counts,
@@ -208,6 +210,9 @@ impl Pass {
         for batch in &set.motion {
             self.units[batch.unit].batch(bins, offset_ns, batch);
         }
+        for part in &set.signals {
+            self.signals[part.signal].samples(bins, offset_ns, &part.samples);
+        }
         for s in set.missing {
             let s = &mut self.streams[s];
             s.missing += 1;
@@ -242,6 +247,7 @@ pub(super) fn gather(
         t0_ns,
         streams: session.streams.iter().map(|_| Stream::new(bins)).collect(),
         units: session.motion.iter().map(|_| motion::Unit::new(bins)).collect(),
+        signals: session.signals.iter().map(|s| signal::Signal::new(bins, s)).collect(),
         sets: 0,
         incomplete: 0,
         at: Counts::new(bins),
@@ -293,6 +299,12 @@ fn put_together(dataset: &Dataset, pass: Pass, messages: MessageSummary, images:
             u.report(record.clone(), account)
         })
         .collect();
+    let signals = (pass.signals.into_iter().zip(&session.signals))
+        .map(|(s, record)| {
+            let account = accounts.remove(&record.id.to_string());
+            s.report(record, pass.last_tick, account)
+        })
+        .collect();
     for (s, samples) in streams.iter_mut().zip(images.fill) {
         s.fill = fill_of(samples);
     }
@@ -328,6 +340,7 @@ fn put_together(dataset: &Dataset, pass: Pass, messages: MessageSummary, images:
         bins,
         streams,
         motion,
+        signals,
         host_clock: messages.clock.report(),
         bytes: messages.bytes,
         segments: dataset.segments().len(),

@@ -58,6 +58,7 @@ pub(super) fn page(r: &Report) -> String {
     plots::clocks(&mut out, r);
     plots::fill(&mut out, r);
     plots::motion(&mut out, r);
+    plots::signals(&mut out, r);
     images(&mut out, r);
     calibration(&mut out, r);
     footer(&mut out, r);

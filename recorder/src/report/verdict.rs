@@ -36,6 +36,7 @@ pub(super) fn of(report: &Report, catalog: Option<&CatalogEntry>) -> Verdict {
     let balanced = report.sets.counts.as_ref().is_none_or(SetsAccount::balances)
         && (report.streams.iter().filter_map(|s| s.account.as_ref()))
             .chain(report.motion.iter().filter_map(|u| u.account.as_ref()))
+            .chain(report.signals.iter().filter_map(|s| s.account.as_ref()))
             .all(crate::StreamAccount::balances);
     if !balanced {
         health = Health::Damaged;
@@ -88,6 +89,7 @@ fn remarks(report: &Report) -> Vec<String> {
     for u in report.motion.iter().filter(|u| u.lost_batches > 0) {
         remarks.push(format!("{}: {} batches of samples were not recorded.", u.record.id, u.lost_batches));
     }
+    remarks.extend(report.signals.iter().flat_map(|s| &s.remarks).map(|what| format!("{what}.")));
     let sets = &report.sets;
     // Streams of one camera with the same losses share a line.
     let mut lines: Vec<(Vec<String>, String)> = Vec::new();

@@ -33,6 +33,9 @@ pub(super) fn trimmed(source: &Session, out: &Path, range: &Range) -> Session {
 pub(super) fn merged(datasets: &[Dataset], out: &Path) -> Session {
     let mut session = datasets.first().map_or_else(|| Session::new("", ""), |d| named(d.session(), out));
     for other in datasets.iter().skip(1).map(Dataset::session) {
+        if other.signals.len() > session.signals.len() {
+            session.signals.clone_from(&other.signals);
+        }
         for note in other.notes.iter().filter(|n| !session.notes.contains(n)).cloned().collect::<Vec<_>>() {
             session.notes.push(note);
         }
@@ -150,6 +153,7 @@ pub(super) fn must_be_one(a: &Dataset, b: &Dataset) -> Result<()> {
     for (u, v) in x.motion.iter().zip(&y.motion).filter(|(u, v)| u.id == v.id && u != v) {
         check(format!("the IMU {} has another pose or device, or is described otherwise", u.id), u == v);
     }
+    check("a signal has other fields".to_owned(), x.has_signals_as(y));
     if differ.is_empty() {
         return Ok(());
     }

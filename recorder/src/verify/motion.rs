@@ -9,7 +9,7 @@ use crate::msgs::frame_info;
 use crate::msgs::motion::{Batch, Imu, read_samples};
 use crate::msgs::tf::unit_frame;
 use crate::recorder::topics::MOTION_CODEC;
-use crate::{Error, ErrorKind, RecordMotion, Result, SET_MOTION_MAX_BYTES, Session};
+use crate::{RecordMotion, Result, Session};
 use depthrig_bus::{FrameFlags, FrameHeader, StreamId};
 use std::collections::BTreeMap;
 
@@ -18,8 +18,6 @@ pub(super) use set::set;
 /// The messages of IMUs since the last commit mark.
 #[derive(Default)]
 pub(super) struct Messages {
-    /// Bytes of all of them.
-    bytes: u64,
     batches: Vec<Waiting>,
     /// Samples without a header before them, by IMU.
     stray: BTreeMap<StreamId, u64>,
@@ -50,17 +48,8 @@ struct Single {
 }
 
 impl Messages {
-    /// Takes a message of an IMU; whether it is one. More than a set may have is not kept.
+    /// Takes a message of an IMU; whether it is one.
     pub(super) fn take(&mut self, kind: &Kind, m: &Message<'_>, decode: bool) -> Result<bool> {
-        if kind.is_motion() {
-            self.bytes = self.bytes.saturating_add(m.data.len() as u64);
-            if self.bytes > SET_MOTION_MAX_BYTES {
-                *self = Self::default();
-                let what =
-                    format!("a set has more than {SET_MOTION_MAX_BYTES} bytes of motion before its mark");
-                return Err(Error::new(ErrorKind::Corrupt, what));
-            }
-        }
         match kind {
             Kind::UnitInfo(unit) => {
                 let (header, extra) = frame_info::read(m.data)?;

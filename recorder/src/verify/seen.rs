@@ -1,8 +1,8 @@
 //! The messages of a segment that wait for the mark of their set.
 
-use super::motion::Messages;
-use super::{Findings, Severity};
+use super::{Findings, Severity, motion, signals};
 use crate::container::scan::HEAD;
+use crate::frame::Waiting;
 use depthrig_bus::StreamId;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -18,7 +18,10 @@ pub(super) struct Seen<'a> {
     pub(super) images: BTreeMap<StreamId, Image>,
     pub(super) infos: BTreeMap<StreamId, (u64, Vec<u8>)>,
     pub(super) calibrated: BTreeSet<StreamId>,
-    pub(super) motion: Messages,
+    pub(super) motion: motion::Messages,
+    pub(super) signals: signals::Messages,
+    /// Bytes of the two.
+    pub(super) waiting: Waiting,
 }
 
 impl<'a> Seen<'a> {
@@ -30,7 +33,9 @@ impl<'a> Seen<'a> {
             images: BTreeMap::new(),
             infos: BTreeMap::new(),
             calibrated: BTreeSet::new(),
-            motion: Messages::default(),
+            motion: motion::Messages::default(),
+            signals: signals::Messages::default(),
+            waiting: Waiting::default(),
         }
     }
 

@@ -7,14 +7,15 @@
 
 use super::images::{Images, with_workers};
 use super::index::Contents;
-use super::motion;
 use super::records::Records;
 use super::seen::{Image, MESSAGE_HEAD, Proof, Seen};
 use super::sets::Walk;
 use super::{Findings, Severity, Watch, file_name};
+use super::{motion, signals};
 use crate::container::record::op;
 use crate::container::scan::{ChannelInfo, HEAD, Message, SegmentReader};
 use crate::dataset::{Kind, kind_of};
+use crate::frame::Waiting;
 use crate::fs::Fs;
 use crate::msgs::frame_set::{Checkpoint, FrameSetMsg, read_clock_pair};
 use crate::msgs::schemas::Schema;
@@ -162,7 +163,8 @@ impl<'a> Pass<'a> {
         if !self.stands_alone {
             self.seen.broken(None, "it does not stand alone: the session is not in it");
         }
-        for what in walk.units.channels(&self.kinds.values()) {
+        let channels = walk.units.channels(&self.kinds.values());
+        for what in channels.into_iter().chain(walk.signals.channels(&self.kinds.values())) {
             self.seen.broken(None, what);
         }
         if !self.seen.images.is_empty() {
@@ -378,8 +380,14 @@ impl<'a> Pass<'a> {
             self.seen.calibrated.insert(id.clone());
             return Ok(());
         }
-        match self.kinds.get(&m.channel) {
+        let kind = self.kinds.get(&m.channel);
+        if let Some(Err(what)) = kind.map(|kind| kind.count(&mut self.seen.waiting, m.data.len())) {
+            (self.seen.waiting, self.seen.motion, self.seen.signals) = Default::default();
+            return Err(Error::new(ErrorKind::Corrupt, what));
+        }
+        match kind {
             Some(kind) if self.seen.motion.take(kind, m, walk.compares_singles)? => {}
+            Some(kind) if self.seen.signals.take(kind, m) => {}
             Some(Kind::Image(id)) => {
                 let len = m.data.len() as u64;
                 let proof = Proof::Crc(crc32fast::hash(m.data));
@@ -393,6 +401,8 @@ impl<'a> Pass<'a> {
                 let set = FrameSetMsg::read(m.data)?;
                 walk.set(&mut self.seen, &set, m.log_time, offset, images);
                 motion::set(walk, &mut self.seen, &set, m.log_time, offset);
+                signals::set(walk, &mut self.seen, &set, m.log_time, offset);
+                self.seen.waiting = Waiting::default();
                 (self.seen.images, self.seen.infos, self.seen.calibrated) = Default::default();
             }
             Some(_) | None => {}

@@ -3,6 +3,7 @@
 use super::images::{Images, Job};
 use super::motion::Units;
 use super::seen::{Image, MESSAGE_HEAD, Proof, Seen};
+use super::signals::Signals;
 use super::{Findings, Severity, VerifyOptions};
 use crate::clock::step_ns;
 use crate::container::record::{op, put_le};
@@ -41,6 +42,7 @@ pub(super) struct Walk {
     /// Captured and lost frames, by the last frame of each stream.
     frame_accounts: BTreeMap<StreamId, FrameAccount>,
     pub(super) units: Units,
+    pub(super) signals: Signals,
     /// The first and the last reading of the host's clocks.
     clocks: Option<(UtcPair, UtcPair)>,
 }
@@ -79,6 +81,7 @@ impl Walk {
             accounts: BTreeMap::new(),
             frame_accounts: BTreeMap::new(),
             units: Units::new(session),
+            signals: Signals::new(session),
             clocks: None,
         }
     }
@@ -334,8 +337,9 @@ impl Walk {
         }
         for a in self.accounts.values().filter(|a| a.dropped.total() > 0) {
             let reasons: Vec<_> = a.dropped.nonzero().map(|(r, n)| format!("{n} {}", r.name())).collect();
+            let items = if self.signals.has(&a.stream) { "samples" } else { "frames" };
             let what = format!(
-                "{} of {} frames of {} were lost live: {}",
+                "{} of {} {items} of {} were lost live: {}",
                 a.dropped.total(),
                 a.captured,
                 a.stream,
@@ -344,6 +348,7 @@ impl Walk {
             findings.add(Severity::Note, "accounts", None, what);
         }
         self.units.finish(findings);
+        self.signals.finish(self.last.as_ref().map(|last| last.tick_ns), findings);
         let Some(session) = whole else { return };
         let file = crate::SESSION_FILE;
         let Some(o) = &session.outcome else {

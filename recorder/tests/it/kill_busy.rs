@@ -116,6 +116,7 @@ fn child() {
             frames: frames.collect(),
             missing: Vec::new(),
             motion: Vec::new(),
+            signals: Vec::new(),
             spread_ns: 0,
         };
         // A refused set is counted, and the count must be in the file.

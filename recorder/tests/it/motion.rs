@@ -6,9 +6,9 @@ use crate::verify::{check, found, rewrite};
 use depthrig_bus::{FrameFlags, FrameHeader, HostTime, MotionSample, PixelFormat};
 use depthrig_recorder::fs::MemFs;
 use depthrig_recorder::{
-    CompareOptions, Dataset, ErrorKind, FrameChoice, MotionForm, MotionRecord, MotionRow, PixelMode,
-    RecordMotion, RecordSet, Recorder, SET_MOTION_MAX_BYTES, Session, SetChoice, SetDrop, SetRange, Severity,
-    SliceOptions, VerifyOptions, compare, export_motion, list_frames, list_motion, merge,
+    CompareOptions, Dataset, ErrorKind, FrameChoice, MotionRecord, MotionRow, PixelMode, RecordMotion,
+    RecordSet, Recorder, SET_MOTION_MAX_BYTES, SampleForm, SampleRow, Session, SetChoice, SetDrop, SetRange,
+    Severity, SliceOptions, VerifyOptions, compare, export_samples, list_frames, list_samples, merge,
 };
 use std::ops::ControlFlow;
 use std::sync::Arc;
@@ -544,11 +544,14 @@ fn samples_are_listed_and_written() {
     let dataset = open(&fs);
     let side = "side/imu".parse().unwrap();
     let mut rows = Vec::new();
-    let listed = list_motion(&dataset, &side, SetChoice::Id(2), &mut |row| {
+    let mut head = String::new();
+    let listed = list_samples(&dataset, &side, SetChoice::Id(2), &mut |line| head = line, &mut |row| {
+        let SampleRow::Motion(row) = row else { panic!("{row:?}") };
         rows.push(row);
         ControlFlow::Continue(())
     })
     .unwrap();
+    assert_eq!(head, MotionRow::COLUMNS.join(","));
     let per_set = BATCHES * SAMPLES;
     assert_eq!((listed.sets, listed.frames, rows.len() as u64), (1, per_set, per_set));
     let want = sample(1, per_set);
@@ -568,16 +571,16 @@ fn samples_are_listed_and_written() {
     let units = ["front/imu".parse().unwrap(), side];
     let mut go = |_| ControlFlow::Continue(());
     let out = std::path::Path::new("/data/csv");
-    let done = export_motion(&fs, &dataset, &units, all, MotionForm::Csv, out, &mut go).unwrap();
+    let done = export_samples(&fs, &dataset, &units, all, SampleForm::Csv, out, &mut go).unwrap();
     assert_eq!((done.sets, done.frames, done.lost), (3, 2 * 3 * per_set, 0));
     let text = String::from_utf8(contents(&fs, &out.join("side/imu.csv"))).unwrap();
     assert_eq!(text.lines().count() as u64, 1 + 3 * per_set);
     assert_eq!(text.lines().nth(1 + per_set as usize), Some(line.as_str()));
-    let e = export_motion(&fs, &dataset, &units, all, MotionForm::Csv, out, &mut go).unwrap_err();
+    let e = export_samples(&fs, &dataset, &units, all, SampleForm::Csv, out, &mut go).unwrap_err();
     assert_eq!(e.kind(), ErrorKind::AlreadyExists);
 
     let out = std::path::Path::new("/data/npy");
-    export_motion(&fs, &dataset, &units, all, MotionForm::Npy, out, &mut go).unwrap();
+    export_samples(&fs, &dataset, &units, all, SampleForm::Npy, out, &mut go).unwrap();
     let file = contents(&fs, &out.join("front/imu.npy"));
     let head = 10 + u16::from_le_bytes([file[8], file[9]]) as usize;
     assert_eq!((head % 64, file.len() - head), (0, 3 * per_set as usize * 80));
@@ -587,8 +590,10 @@ fn samples_are_listed_and_written() {
     assert_eq!(file[head + 96..head + 160], sample(0, 1).to_bytes());
 
     let none = "top/imu".parse().unwrap();
-    let e = list_motion(&dataset, &none, all, &mut |_| ControlFlow::Continue(())).unwrap_err().to_string();
-    assert_eq!(e, "there is no IMU top/imu; the dataset has front/imu, side/imu");
+    let e = list_samples(&dataset, &none, all, &mut |_| {}, &mut |_| ControlFlow::Continue(()))
+        .unwrap_err()
+        .to_string();
+    assert_eq!(e, "there is no IMU or signal top/imu; the dataset has front/imu, side/imu");
     let images = FrameChoice { streams: units.to_vec(), ..FrameChoice::default() };
     let e = list_frames(&dataset, &images, &mut |_| ControlFlow::Continue(())).unwrap_err().to_string();
     assert!(e.contains("front/imu is an IMU"), "{e}");

@@ -180,6 +180,7 @@ pub fn set_of(session: &Session, n: u64, streams: &[usize]) -> RecordSet {
         tick: HostTime::from_ns(M0 + n as i64 * PERIOD),
         utc: UtcPair { mono: HostTime::from_ns(M0), utc_ns: T0, width_ns: 100 },
         motion: motion(session, n),
+        signals: Vec::new(),
         spread_ns: times.iter().max().unwrap_or(&0) - times.iter().min().unwrap_or(&0),
         missing: (0..session.streams.len()).filter(|i| !streams.contains(i)).collect(),
         frames,

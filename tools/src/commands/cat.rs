@@ -12,8 +12,8 @@ use core::ops::ControlFlow;
 use depthrig_bus::StreamId;
 use depthrig_recorder::fs::RealFs;
 use depthrig_recorder::{
-    Dataset, Edge, FrameChoice, FrameRow, FramesDone, Moment, MotionForm, MotionRow, SetChoice, SetSpan,
-    StillFormat, export_frames, export_motion, list_frames, list_motion,
+    Dataset, Edge, FrameChoice, FrameRow, FramesDone, Moment, SampleForm, SetChoice, SetSpan, StillFormat,
+    export_frames, export_samples, list_frames, list_samples, sampled,
 };
 use std::path::PathBuf;
 
@@ -33,6 +33,9 @@ each), with --out DIR they are written to DIR/CAM/imu.csv, or with --format npy 
 set they belong to, UTC, host monotonic time, device time, number, uncertainty, angular velocity in rad/s, acceleration
 in m/s2, temperature and flags; a missing value is empty (NaN in NPY).
 
+A signal of a robot (--stream arm/joint_position) is written in the same way. Columns: set, UTC, host monotonic time,
+time of publishing, publisher, number, uncertainty, flags, then each field by its name. A text needs CSV or JSON.
+
 Exit codes: 0 success, 1 failure, 2 wrong usage, 3 written, but some frames of the dataset could not be read.
 
 Examples:
@@ -47,7 +50,7 @@ Examples:
 pub struct CatArgs {
     /// Dataset folder, or one segment file
     dataset: PathBuf,
-    /// Only this stream or IMU; repeatable
+    /// Only this stream, IMU or signal; repeatable
     #[arg(long = "stream", value_name = "CAM/STREAM")]
     streams: Vec<StreamId>,
     /// Only the set with this id
@@ -101,10 +104,10 @@ pub fn run(args: &CatArgs, context: &Context) -> Result<Exit> {
         _ => SetChoice::Span(SetSpan { from: args.from.map(Edge::Moment), to: args.to.map(Edge::Moment) }),
     };
     let choice = FrameChoice { sets, every: args.every as usize, streams: args.streams.clone() };
-    let units = dataset.session().motion.iter();
-    let units: Vec<_> = units.map(|u| &u.id).filter(|id| args.streams.contains(id)).cloned().collect();
+    let units = sampled(dataset.session());
+    let units: Vec<_> = units.filter(|id| args.streams.contains(id)).cloned().collect();
     if !units.is_empty() && args.streams.iter().all(|s| units.contains(s)) {
-        return motion(args, &dataset, &units, sets);
+        return samples(args, &dataset, &units, sets);
     }
     let done = match &args.out {
         None => list(args, &dataset, &choice)?,
@@ -120,11 +123,11 @@ pub fn run(args: &CatArgs, context: &Context) -> Result<Exit> {
     })
 }
 
-/// Lists or writes IMU samples.
-fn motion(args: &CatArgs, dataset: &Dataset, units: &[StreamId], sets: SetChoice) -> Result<Exit> {
+/// Lists or writes samples of IMUs and signals.
+fn samples(args: &CatArgs, dataset: &Dataset, units: &[StreamId], sets: SetChoice) -> Result<Exit> {
     let form = match args.format {
-        None => MotionForm::Csv,
-        Some(Form::Npy) => MotionForm::Npy,
+        None => SampleForm::Csv,
+        Some(Form::Npy) => SampleForm::Npy,
         Some(Form::Png | Form::Jpg) => {
             return Err(
                 UsageError(format!("{} has no images; leave out --format or say npy", units[0])).into()
@@ -132,12 +135,12 @@ fn motion(args: &CatArgs, dataset: &Dataset, units: &[StreamId], sets: SetChoice
         }
     };
     if args.every > 1 {
-        return Err(UsageError("--every chooses images; an IMU is listed whole".into()).into());
+        return Err(UsageError("--every chooses images; samples are listed whole".into()).into());
     }
     let done = if let Some(dir) = &args.out {
         let stop = Stop::on_signals()?;
         let mut go = |_| if stop.is_asked() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) };
-        let done = export_motion(&RealFs, dataset, units, sets, form, dir, &mut go).map_err(usage)?;
+        let done = export_samples(&RealFs, dataset, units, sets, form, dir, &mut go).map_err(usage)?;
         if args.json {
             out::json(&done)?;
         } else {
@@ -148,9 +151,10 @@ fn motion(args: &CatArgs, dataset: &Dataset, units: &[StreamId], sets: SetChoice
         done
     } else {
         let [unit] = units else {
-            return Err(UsageError("one IMU at a time is listed; name a folder with --out".into()).into());
+            let what = "one IMU or signal at a time is listed; name a folder with --out";
+            return Err(UsageError(what.into()).into());
         };
-        list_samples(args, dataset, unit, sets)?
+        list_rows(args, dataset, unit, sets)?
     };
     for problem in &done.problems {
         out::note(format_args!("lost: {problem}"));
@@ -162,12 +166,15 @@ fn motion(args: &CatArgs, dataset: &Dataset, units: &[StreamId], sets: SetChoice
     })
 }
 
-fn list_samples(args: &CatArgs, dataset: &Dataset, unit: &StreamId, sets: SetChoice) -> Result<FramesDone> {
-    if !args.json {
-        out::line(MotionRow::COLUMNS.join(","))?;
-    }
+fn list_rows(args: &CatArgs, dataset: &Dataset, unit: &StreamId, sets: SetChoice) -> Result<FramesDone> {
     let mut failed = None;
-    let done = list_motion(dataset, unit, sets, &mut |row| {
+    let mut head_failed = None;
+    let mut head = |line| {
+        if !args.json {
+            head_failed = out::line(line).err();
+        }
+    };
+    let done = list_samples(dataset, unit, sets, &mut head, &mut |row| {
         let written = if args.json { out::json_line(&row) } else { out::line(row.csv()) };
         match written {
             Ok(()) => ControlFlow::Continue(()),
@@ -178,7 +185,7 @@ fn list_samples(args: &CatArgs, dataset: &Dataset, unit: &StreamId, sets: SetCho
         }
     })
     .map_err(usage)?;
-    failed.map_or(Ok(done), Err)
+    head_failed.or(failed).map_or(Ok(done), Err)
 }
 
 fn list(args: &CatArgs, dataset: &Dataset, choice: &FrameChoice) -> Result<FramesDone> {

@@ -141,6 +141,23 @@ fn text(info: &DatasetInfo, lost: &[String]) -> String {
             }),
         ));
     }
+    if !info.signals.is_empty() {
+        lines.push(String::new());
+        lines.push(out::table(
+            &["signal", "kind", "samples", "Hz", "lost", "restarts"],
+            2,
+            info.signals.iter().map(|s| {
+                vec![
+                    s.signal.clone(),
+                    s.kind.to_owned(),
+                    s.samples.to_string(),
+                    format!("{:.1}", s.rate_hz),
+                    s.lost.to_string(),
+                    s.restarts.to_string(),
+                ]
+            }),
+        ));
+    }
     let mut add = |what: &str, text: &str| lines.push(format!("{what}: {}", printable::line(text)));
     if let Some(c) = &info.calibration {
         let attached = c.attached_utc_ns.map_or_else(

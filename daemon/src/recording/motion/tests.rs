@@ -186,16 +186,16 @@ fn rare_sets_have_timeout_for_two_of_them() {
     with_two(2.0, |a, _, _, _| {
         let facts = [facts_of(&a.facts.stream)];
         // Batches are at most 100 ms old, so that ten a second may come.
-        assert_eq!(Units::new(&facts, 5.0).units[0].most, 40);
-        assert_eq!(Units::new(&facts, 0.1).units[0].most, 200);
+        assert_eq!(Units::new(&facts, 5.0).waiting.most(0), 40);
+        assert_eq!(Units::new(&facts, 0.1).waiting.most(0), 200);
         // Two sets that are an hour apart would have more than one may hold.
-        let rare = Units::new(&facts, 1.0 / 3600.0).units[0].most;
-        let bytes = rare as u64 * RecordMotion::stored_bytes_of(4);
+        let rare = Units::new(&facts, 1.0 / 3600.0).waiting.most(0);
+        let bytes = rare * RecordMotion::stored_bytes_of(4);
         assert!(
             bytes <= SET_MOTION_MAX_BYTES && bytes > SET_MOTION_MAX_BYTES * 9 / 10,
             "{rare} batches of {bytes} bytes"
         );
         let two = [facts_of(&a.facts.stream), facts_of(&a.facts.stream)];
-        assert_eq!(Units::new(&two, 1.0 / 3600.0).units[0].most, rare / 2, "both share it");
+        assert_eq!(Units::new(&two, 1.0 / 3600.0).waiting.most(0), rare / 2, "both share it");
     });
 }

@@ -193,7 +193,8 @@ impl Importer for Write<'_> {
             frames.append(&mut refined);
             let utc = UtcPair { mono: tick, utc_ns, width_ns: 0 };
             let motion = set.motion;
-            return Ok(Some(RecordSet { id, tick, utc, frames, missing, motion, spread_ns }));
+            let signals = set.signals;
+            return Ok(Some(RecordSet { id, tick, utc, frames, missing, motion, signals, spread_ns }));
         }
         Ok(None)
     }

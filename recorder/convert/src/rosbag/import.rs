@@ -318,6 +318,7 @@ impl Importer for RosbagImport {
             frames: Vec::new(),
             missing: Vec::new(),
             motion: Vec::new(),
+            signals: Vec::new(),
             spread_ns: 0,
         };
         for (stream, frame) in set.frames.iter().enumerate() {

@@ -6,8 +6,8 @@ use depthrig_bus::{
 };
 use depthrig_calib::PoseExt;
 use depthrig_recorder::{
-    Dataset, DatasetFrame, Derived, Error, ErrorKind, PixelMode, RecordMotion, Result, Session, SetReader,
-    StreamAccount, StreamRecord,
+    Dataset, DatasetFrame, Derived, Error, ErrorKind, PixelMode, RecordMotion, RecordSignal, Result, Session,
+    SetReader, StreamAccount, StreamRecord,
 };
 use depthrig_zed::conf::StereoCalibration;
 use depthrig_zed::replay::{self, Pair, Source};
@@ -28,6 +28,8 @@ pub(super) struct Head {
     pub(super) left: Option<Box<FrameHeader>>,
     /// IMU batches of the camera since the set before.
     pub(super) motion: Vec<RecordMotion>,
+    /// Samples of signals since the set before.
+    pub(super) signals: Vec<RecordSignal>,
 }
 
 /// The next item of an input.
@@ -294,8 +296,9 @@ impl Input {
                     Some(RecordMotion { unit, ..m })
                 });
                 let motion: Vec<_> = motion.collect();
+                let signals = std::mem::take(&mut set.signals);
                 let of = |stream| set.frames.iter().find(|f| f.stream == stream);
-                let head = |left: Option<Box<FrameHeader>>, motion| Head {
+                let head = |left: Option<Box<FrameHeader>>| Head {
                     set: set.id,
                     tick: set.tick,
                     utc: UtcPair {
@@ -305,17 +308,16 @@ impl Input {
                     },
                     left,
                     motion,
+                    signals,
                 };
                 let (Some(l), Some(r)) = (of(*left), of(*right)) else {
-                    return Ok(Next::Pair(head(None, motion), None));
+                    return Ok(Next::Pair(head(None), None));
                 };
                 return Ok(match (packed(l), packed(r)) {
                     (Ok((format, left)), Ok((_, right))) => {
-                        Next::Pair(head(Some(Box::new(l.header)), motion), Some(Raw { format, left, right }))
+                        Next::Pair(head(Some(Box::new(l.header))), Some(Raw { format, left, right }))
                     }
-                    (Err(e), _) | (_, Err(e)) => {
-                        Next::Damaged(head(None, motion), format!("set {}: {e}", set.id))
-                    }
+                    (Err(e), _) | (_, Err(e)) => Next::Damaged(head(None), format!("set {}: {e}", set.id)),
                 });
             },
             Kind::Recording { source, pair, first_ns, timed_utc } => {
@@ -333,6 +335,7 @@ impl Input {
                     utc: UtcPair { mono: HostTime::from_ns(FIRST_NS), utc_ns: start, width_ns: 0 },
                     left: None,
                     motion: Vec::new(),
+                    signals: Vec::new(),
                 };
                 if let replay::Next::Damaged(why) = next {
                     let what = format!("pair {} of {}: {why}", pair.index, info.path.display());

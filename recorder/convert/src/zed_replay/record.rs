@@ -177,6 +177,7 @@ impl Sink<'_> {
                 frames: Vec::new(),
                 missing,
                 motion: head.motion,
+                signals: head.signals,
                 spread_ns: 0,
             };
         };
@@ -217,6 +218,7 @@ impl Sink<'_> {
             frames,
             missing: Vec::new(),
             motion: head.motion,
+            signals: head.signals,
             spread_ns: 0,
         }
     }

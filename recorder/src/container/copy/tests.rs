@@ -47,8 +47,17 @@ fn recorded(sets: u64) -> (MemFs, PathBuf) {
         let utc = UtcPair { mono: HostTime::from_ns(0), utc_ns: 1, width_ns: 0 };
         let tick = HostTime::from_ns(n as i64 + 1);
         let frames = session.streams.iter().enumerate().map(frame).collect();
-        r.push(RecordSet { id: n, tick, utc, frames, missing: Vec::new(), motion: Vec::new(), spread_ns: 0 })
-            .unwrap();
+        r.push(RecordSet {
+            id: n,
+            tick,
+            utc,
+            frames,
+            missing: Vec::new(),
+            motion: Vec::new(),
+            signals: Vec::new(),
+            spread_ns: 0,
+        })
+        .unwrap();
         while r.progress().sets.recorded <= n {
             std::thread::sleep(Duration::from_millis(1));
         }

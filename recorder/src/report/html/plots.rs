@@ -3,7 +3,7 @@
 use super::{END_TABLE, count, escape, ms, row, table};
 use crate::catalog::Health;
 use crate::report::svg::{self, Strip, Time, Trace, nice_end, number};
-use crate::report::{MotionReport, Quantiles, Range, Report, StreamReport};
+use crate::report::{FieldSeries, MotionReport, Quantiles, Range, Report, StreamReport};
 use std::fmt::Write;
 
 /// Acceleration that an IMU at rest measures, m/s² (standard gravity).
@@ -104,7 +104,9 @@ pub(super) fn losses(out: &mut String, r: &Report) {
         out.push_str("</tr>");
     }
     let units = r.motion.iter().map(|u| (&u.record.id, &u.account));
-    for (id, account) in r.streams.iter().map(|s| (&s.record.id, &s.account)).chain(units) {
+    let signals = r.signals.iter().map(|s| (&s.id, &s.account));
+    let streams = r.streams.iter().map(|s| (&s.record.id, &s.account));
+    for (id, account) in streams.chain(units).chain(signals) {
         let _ = write!(out, "<tr><td>{}</td>", escape(&id.to_string()));
         let Some(a) = account else {
             out.push_str("<td colspan=\"2\">no account in the file</td></tr>");
@@ -313,6 +315,58 @@ pub(super) fn motion(out: &mut String, r: &Report) {
         let pushes = r.motion.iter().map(|u| strip(u, "acceleration", &u.acceleration_series, Some(GRAVITY)));
         let pushes: Vec<_> = pushes.collect();
         out.push_str(&svg::strips("Acceleration over time, per IMU", "m/s²", time(r), &pushes));
+    }
+    out.push_str("</section>");
+}
+
+pub(super) fn signals(out: &mut String, r: &Report) {
+    const COLUMNS: [&str; 6] = ["signal", "kind", "#samples", "#samples/s", "#not recorded", "#restarts"];
+    if r.signals.is_empty() {
+        return;
+    }
+    out.push_str("<section><h2>Signals</h2>");
+    table(out, &COLUMNS);
+    for s in &r.signals {
+        let cells = [
+            s.id.to_string(),
+            s.kind.to_owned(),
+            s.samples.to_string(),
+            format!("{:.1}", s.samples_hz),
+            s.lost.to_string(),
+            s.restarts.to_string(),
+        ];
+        row(out, &COLUMNS, &cells);
+    }
+    out.push_str(END_TABLE);
+    if r.bins.span_ns > 0 {
+        out.push_str("<p class=\"cap\">The values of each signal, least, mean and greatest in steps.</p>");
+        for s in r.signals.iter().filter(|s| !s.fields.is_empty()) {
+            let strip = |field: &FieldSeries| {
+                let values = || field.series.iter().flatten();
+                let least = values().map(|v| v.min).fold(f64::INFINITY, f64::min);
+                let most = values().map(|v| v.max).fold(f64::NEG_INFINITY, f64::max);
+                let (note, y) = if least <= most {
+                    // A constant needs room around it.
+                    let margin = (0.05 * (most - least)).max(1e-9 * (1.0 + most.abs()));
+                    (format!("{} to {}", number(least), number(most)), (least - margin, most + margin))
+                } else {
+                    ("no number".to_owned(), (0.0, 1.0))
+                };
+                Strip {
+                    label: field.name.clone(),
+                    note,
+                    trace: Trace::Steps(
+                        field.series.iter().map(|v| v.map(|v| (v.min, v.mean, v.max))).collect(),
+                    ),
+                    y,
+                    nominal: None,
+                    marks: [Vec::new(), Vec::new()],
+                }
+            };
+            let strips: Vec<_> = s.fields.iter().map(strip).collect();
+            let _ = write!(out, "<h3>{}</h3>", escape(&s.id.to_string()));
+            out.push_str(&svg::strips(&format!("{} over time", s.id), &escape(&s.unit), time(r), &strips));
+        }
     }
     out.push_str("</section>");
 }

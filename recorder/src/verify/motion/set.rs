@@ -17,7 +17,7 @@ pub(in crate::verify) fn set(
     log_time: u64,
     offset: u64,
 ) {
-    let Messages { batches, stray, mut single, .. } = std::mem::take(&mut seen.motion);
+    let Messages { batches, stray, mut single } = std::mem::take(&mut seen.motion);
     let mut problems = Vec::new();
     for (unit, n) in stray {
         problems.push(format!("{n} batches of {unit} have no frame_info"));

@@ -139,7 +139,16 @@ impl Store {
         let tick = HostTime::from_ns(tick_ns);
         let utc = UtcPair { mono: tick, utc_ns: tick_ns, width_ns: 0 };
         *lock(&self.clock) = utc;
-        let set = RecordSet { id: self.next, tick, utc, frames, missing, motion: Vec::new(), spread_ns };
+        let set = RecordSet {
+            id: self.next,
+            tick,
+            utc,
+            frames,
+            missing,
+            motion: Vec::new(),
+            signals: Vec::new(),
+            spread_ns,
+        };
         self.next += 1;
         self.last_tick_ns = tick_ns;
         let recorder = self.recorder()?;

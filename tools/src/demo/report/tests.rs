@@ -45,6 +45,7 @@ fn recorded(dir: &Path, sets: u64) -> Summary {
                 frames: vec![RecordFrame { stream: 0, header, pixels: Box::new(vec![1; 128]) }],
                 missing: vec![],
                 motion: Vec::new(),
+                signals: Vec::new(),
                 spread_ns: 0,
             })
             .unwrap();

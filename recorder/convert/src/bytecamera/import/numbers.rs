@@ -79,6 +79,7 @@ impl ByteCameraImport {
             frames: Vec::new(),
             missing: Vec::new(),
             motion: Vec::new(),
+            signals: Vec::new(),
             spread_ns: 0,
         };
         for i in 0..self.streams.len() {

@@ -123,6 +123,7 @@ impl ByteCameraImport {
             frames: Vec::new(),
             missing: Vec::new(),
             motion: Vec::new(),
+            signals: Vec::new(),
             spread_ns: first.spread_ns,
         };
         let id = first.set;

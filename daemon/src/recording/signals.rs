@@ -1,0 +1,162 @@
+//! Samples of signals on their way into a recording: they wait for the next set that is handed over, as IMU batches do.
+//!
+//! All of them together take no more than one set may hold; the oldest of a signal that exceeds its share go first, and
+//! are counted. A signal that appears while a recording goes on is recorded from then on. One whose publisher comes back
+//! with other fields is not, until the next recording: the fields of a channel stay the same over a dataset.
+
+use super::waiting::Waiting;
+use depthrig_bus::{DropCounts, DropReason, SignalSample, StreamId};
+use depthrig_recorder::{RecordSignal, Recorder, SET_SIGNALS_MAX_BYTES, SignalRecord, StreamAccount};
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+/// The signals that are published now, as far as a sample of them was read.
+#[derive(Default)]
+pub(super) struct Known(BTreeMap<StreamId, SignalRecord>);
+
+impl Known {
+    /// Takes in samples of the signal `id`, before which `missed` were replaced on the channel; they go to the recording, if
+    /// there is one.
+    pub(super) fn hear(
+        &mut self,
+        recording: Option<(&mut Signals, &Recorder)>,
+        id: &StreamId,
+        samples: Vec<SignalSample>,
+        missed: u64,
+    ) {
+        if let Some(newest) = samples.last() {
+            let description = newest.description();
+            let is_known = self.0.get(id).is_some_and(|r| Arc::ptr_eq(&r.description, description));
+            if !is_known {
+                self.0.insert(id.clone(), SignalRecord::new(description));
+            }
+        }
+        if let Some((signals, recorder)) = recording {
+            signals.hear(recorder, id, samples, missed);
+        }
+    }
+
+    /// Forgets the signals that nobody publishes any more.
+    pub(super) fn keep(&mut self, is_published: impl Fn(&StreamId) -> bool) {
+        self.0.retain(|id, _| is_published(id));
+    }
+
+    /// All of them.
+    pub(super) fn records(&self) -> Vec<SignalRecord> {
+        self.0.values().cloned().collect()
+    }
+}
+
+/// The signals of one recording.
+pub(super) struct Signals {
+    sources: Vec<Source>,
+    waiting: Waiting<SignalSample>,
+    /// Signals that cannot be recorded, so that it is said once.
+    refused: BTreeSet<StreamId>,
+}
+
+struct Source {
+    record: SignalRecord,
+    /// Samples that went to the recorder with sets.
+    handed: u64,
+    /// Samples that were lost on the way here: replaced on the channel, pushed out while they waited, or of other fields.
+    lost: u64,
+    /// Said that its fields changed.
+    is_changed: bool,
+}
+
+impl Signals {
+    /// Those that the recording begins with, in the order of its session.
+    pub(super) fn new(records: Vec<SignalRecord>) -> Self {
+        let mut signals = Self { sources: Vec::new(), waiting: Waiting::new(), refused: BTreeSet::new() };
+        records.into_iter().for_each(|record| signals.add(record));
+        signals
+    }
+
+    fn add(&mut self, record: SignalRecord) {
+        self.sources.push(Source { record, handed: 0, lost: 0, is_changed: false });
+        let share = SET_SIGNALS_MAX_BYTES / 2 / self.sources.len() as u64;
+        self.waiting.add_source(share);
+        for (index, source) in self.sources.iter_mut().enumerate() {
+            source.lost += self.waiting.limit(index, share);
+        }
+    }
+
+    /// Takes in samples of one signal, before which `missed` were replaced on the channel.
+    pub(super) fn hear(
+        &mut self,
+        recorder: &Recorder,
+        id: &StreamId,
+        samples: Vec<SignalSample>,
+        missed: u64,
+    ) {
+        let index = match self.sources.iter().position(|s| s.record.id == *id) {
+            Some(index) => index,
+            None => match samples.first() {
+                Some(sample) if !self.refused.contains(id) => {
+                    let record = SignalRecord::new(sample.description());
+                    if let Err(e) = recorder.add_signal(record.clone()) {
+                        tracing::error!("{e}");
+                        self.refused.insert(id.clone());
+                        return;
+                    }
+                    self.add(record);
+                    self.sources.len() - 1
+                }
+                _ => return,
+            },
+        };
+        let source = &mut self.sources[index];
+        source.lost += missed;
+        for sample in samples {
+            if sample.description() != &source.record.description {
+                source.lost += 1;
+                if !core::mem::replace(&mut source.is_changed, true) {
+                    tracing::error!(
+                        "signal {id} has other fields than when the recording began: its samples are not recorded and \
+                         count as lost; stop the recording and start another one"
+                    );
+                }
+                continue;
+            }
+            let bytes = RecordSignal::sample_bytes(sample.description(), sample.bytes().len());
+            source.lost += self.waiting.push(index, bytes, sample);
+        }
+    }
+
+    /// Everything that waits, for the set that is handed over now.
+    pub(super) fn take(&mut self) -> Vec<RecordSignal> {
+        let mut parts: Vec<RecordSignal> = Vec::new();
+        for signal in 0..self.sources.len() {
+            let mut session = None;
+            for sample in self.waiting.take(signal) {
+                let of = Some(sample.header().session);
+                match parts.last_mut().filter(|_| session == of) {
+                    Some(part) => part.samples.push(sample),
+                    None => parts.push(RecordSignal { signal, samples: vec![sample] }),
+                }
+                session = of;
+            }
+        }
+        parts
+    }
+
+    /// Counts the samples that go to the recorder with a set.
+    pub(super) fn hand_over(&mut self, parts: &[RecordSignal]) {
+        for part in parts {
+            if let Some(source) = self.sources.get_mut(part.signal) {
+                source.handed += part.samples.len() as u64;
+            }
+        }
+    }
+
+    /// Accounts of the signals since the recording began, except for samples that wait.
+    pub(super) fn accounts(&self) -> impl Iterator<Item = StreamAccount> + '_ {
+        self.sources.iter().map(|s| {
+            let mut dropped = DropCounts::default();
+            dropped.add(DropReason::QueueFull, s.lost);
+            let stream = s.record.id.clone();
+            StreamAccount { stream, captured: s.handed + s.lost, delivered: s.handed, dropped }
+        })
+    }
+}
