@@ -133,6 +133,7 @@ impl Importer for SceneSets {
             frames: images.into_iter().enumerate().map(frame).collect(),
             missing: Vec::new(),
             motion: Vec::new(),
+            signals: Vec::new(),
             spread_ns: 0,
         };
         self.done += 1;
