@@ -118,6 +118,17 @@ def wait_for_sets(binary: str, runtime: Path, more: int) -> None:  # noqa: F811
         time.sleep(0.1)
 
 
+def wait_until_recording(binary: str, runtime: Path) -> None:  # noqa: F811
+    deadline = time.monotonic() + WAIT_S
+    while True:
+        asked = [binary, "record", "status", "--json"]
+        said = subprocess.run(asked, env=environment(runtime), capture_output=True, text=True, timeout=WAIT_S, check=False)
+        if said.returncode == 0 and json.loads(said.stdout):
+            return
+        assert time.monotonic() < deadline, said.stderr
+        time.sleep(0.05)
+
+
 def record(binary: str, runtime: Path, folder: Path, name: str) -> Path:  # noqa: F811
     command(binary, runtime, "record", "start", "--name", name)
     return Path(status(binary, runtime)["path"])
@@ -372,6 +383,7 @@ def test_replay_publishes_every_sample_again(binary: str, runtime: Path, recorde
     call = ["replay", str(recorded.dataset), "--paused", "--record", str(again)]
     got: dict[int, bytes] = {}
     with running(binary, runtime, tmp_path / "log", *call, codes=(0, 3)) as process:
+        wait_until_recording(binary, runtime)
         reader = open_reader(runtime, "arm/joint_position")
         command(binary, runtime, "replay", "resume")
         while process.poll() is None:
