@@ -188,7 +188,7 @@ fn a_session_with_a_unit_in_the_wrong_place_is_refused() {
     let long = create(|s| s.motion[1].batch = u32::MAX / 64 + 1);
     assert!(long.contains("side/imu has batches of 67108864 samples, no set can hold one"), "{long}");
     let many = create(|s| s.motion = (0..4_100).map(|i| unit(&format!("c{i}/imu"))).collect());
-    assert!(many.contains("4103 streams and IMUs, 4000 is the limit"), "{many}");
+    assert!(many.contains("4103 streams, IMUs and signals, 4000 is the limit"), "{many}");
     // The output of another program is read as far as a dataset can hold it.
     let fs = MemFs::new();
     record(&fs, 1, options());
