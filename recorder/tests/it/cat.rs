@@ -293,6 +293,7 @@ impl Model {
             s.id = *id;
             s.tick = s.tick.plus_ns(t * UNIT);
             s.motion.clear();
+            s.signals.clear();
             r.push(s).unwrap();
             settle(&r);
         }

@@ -186,8 +186,8 @@ fn a_stalled_disk_costs_sets_and_never_blocks_nor_grows() {
 
 #[test]
 fn a_full_disk_ends_in_a_closed_dataset() {
-    let fs = MemFs::new().with_capacity(110_000);
-    let r = recorder(&fs, RecorderOptions { reserve_bytes: 30_000, ..options() });
+    let fs = MemFs::new().with_capacity(130_000);
+    let r = recorder(&fs, RecorderOptions { reserve_bytes: 45_000, ..options() });
     for n in 0..40 {
         drop(r.push(set(&session(), n)));
         settle(&r);

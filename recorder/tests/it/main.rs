@@ -19,6 +19,7 @@ mod report;
 mod resume;
 mod round_trip;
 mod set_reader;
+mod signals;
 mod slice;
 mod stereo;
 mod structure;

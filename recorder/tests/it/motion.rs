@@ -188,7 +188,7 @@ fn a_session_with_a_unit_in_the_wrong_place_is_refused() {
     let long = create(|s| s.motion[1].batch = u32::MAX / 64 + 1);
     assert!(long.contains("side/imu has batches of 67108864 samples, no set can hold one"), "{long}");
     let many = create(|s| s.motion = (0..4_100).map(|i| unit(&format!("c{i}/imu"))).collect());
-    assert!(many.contains("4103 streams, IMUs and signals, 4000 is the limit"), "{many}");
+    assert!(many.contains("4105 streams, IMUs and signals, 4000 is the limit"), "{many}");
     // The output of another program is read as far as a dataset can hold it.
     let fs = MemFs::new();
     record(&fs, 1, options());
@@ -231,16 +231,16 @@ fn other_readers_find_the_samples_one_by_one() {
 }
 
 #[test]
-fn a_dataset_without_a_unit_is_as_it_always_was() {
+fn a_dataset_without_units_and_signals_is_as_it_always_was() {
     let fs = MemFs::new();
-    let plain = Session { motion: Vec::new(), ..session() };
+    let plain = Session { motion: Vec::new(), signals: Vec::new(), ..session() };
     let r = Recorder::create(Arc::new(fs.clone()), &dir(), plain.clone(), options()).unwrap();
     r.push(set(&plain, 0)).unwrap();
     assert!(r.finish().unwrap().complete);
     let bytes = contents(&fs, &segment(0));
     let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
     assert_eq!(summary.schemas.len(), 12);
-    assert!(summary.channels.values().all(|c| !c.topic.contains("imu")));
+    assert!(summary.channels.values().all(|c| !c.topic.contains("imu") && !c.topic.contains("arm")));
     assert!(!String::from_utf8(contents(&fs, &dir().join("session.toml"))).unwrap().contains("motion"));
     let set = open(&fs).sets_with(SetRange::ALL, PixelMode::None).next().unwrap().unwrap();
     assert!(set.motion.is_empty() && set.tick == HostTime::from_ns(M0));
@@ -593,7 +593,10 @@ fn samples_are_listed_and_written() {
     let e = list_samples(&dataset, &none, all, &mut |_| {}, &mut |_| ControlFlow::Continue(()))
         .unwrap_err()
         .to_string();
-    assert_eq!(e, "there is no IMU or signal top/imu; the dataset has front/imu, side/imu");
+    assert_eq!(
+        e,
+        "there is no IMU or signal top/imu; the dataset has front/imu, side/imu, arm/joints, arm/gripper"
+    );
     let images = FrameChoice { streams: units.to_vec(), ..FrameChoice::default() };
     let e = list_frames(&dataset, &images, &mut |_| ControlFlow::Continue(())).unwrap_err().to_string();
     assert!(e.contains("front/imu is an IMU"), "{e}");

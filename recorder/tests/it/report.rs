@@ -186,8 +186,8 @@ fn every_loss_has_its_reason_and_the_sums_are_checked() {
 /// The last account in the file lacks these losses, because nothing more could be written.
 #[test]
 fn sets_lost_to_a_full_disk_are_reported() {
-    let fs = MemFs::new().with_capacity(110_000);
-    let recorder = recorder(&fs, RecorderOptions { reserve_bytes: 30_000, ..options() });
+    let fs = MemFs::new().with_capacity(130_000);
+    let recorder = recorder(&fs, RecorderOptions { reserve_bytes: 45_000, ..options() });
     for n in 0..40 {
         drop(recorder.push(set(&session(), n)));
         settle(&recorder);

@@ -698,8 +698,8 @@ fn the_end_of_a_recording_that_was_cut_off_is_said() {
 /// After a write that failed no account is written: only the session says how many sets came after it.
 #[test]
 fn sets_lost_after_a_failed_write_stay_counted() {
-    let full = MemFs::new().with_capacity(110_000);
-    let r = recorder(&full, RecorderOptions { reserve_bytes: 30_000, ..options() });
+    let full = MemFs::new().with_capacity(130_000);
+    let r = recorder(&full, RecorderOptions { reserve_bytes: 45_000, ..options() });
     for n in 0..40 {
         drop(r.push(set(&session(), n)));
         settle(&r);

@@ -1,12 +1,13 @@
 //! A small rig whose images and headers follow from the set's number.
 
 use depthrig_bus::{
-    FrameFlags, FrameHeader, HostTime, Intrinsics, MotionFlags, MotionSample, PixelFormat, Pose, UtcPair,
+    FieldType, FrameFlags, FrameHeader, HostTime, Intrinsics, MotionFlags, MotionSample, PixelFormat, Pose,
+    SignalDescription, SignalField, SignalHeader, SignalName, SignalSample, UtcPair,
 };
 use depthrig_recorder::fs::{Fs, MemFs};
 use depthrig_recorder::{
-    Dataset, DatasetSet, MotionRecord, RecordFrame, RecordMotion, RecordSet, Recorder, RecorderOptions,
-    Session, StreamRecord, Summary,
+    Dataset, DatasetSet, MotionRecord, RecordFrame, RecordMotion, RecordSet, RecordSignal, Recorder,
+    RecorderOptions, Session, SignalRecord, StreamRecord, Summary,
 };
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -57,6 +58,7 @@ pub fn session() -> Session {
         stream("side/ir_left", PixelFormat::Mono8, 40, 30),
     ];
     s.motion = vec![unit("front/imu"), unit("side/imu")];
+    s.signals = vec![joints("arm/joints"), gripper("arm/gripper")];
     s
 }
 
@@ -114,6 +116,64 @@ pub fn batch(session: &Session, unit: usize, b: u64) -> RecordMotion {
 pub fn motion(session: &Session, n: u64) -> Vec<RecordMotion> {
     let batches = n * BATCHES..(n + 1) * BATCHES;
     batches.flat_map(|b| (0..session.motion.len()).map(move |u| batch(session, u, b))).collect()
+}
+
+fn name(id: &str) -> SignalName {
+    let (device, signal) = id.split_once('/').unwrap();
+    SignalName::new(device, signal).unwrap()
+}
+
+/// A signal of two joint angles.
+pub fn joints(id: &str) -> SignalRecord {
+    SignalRecord::new(&Arc::new(SignalDescription::joints(name(id), &["shoulder", "elbow"], "rad").unwrap()))
+}
+
+/// A signal of a number, a bool and a text.
+pub fn gripper(id: &str) -> SignalRecord {
+    let fields = vec![
+        SignalField::new("width", FieldType::F64, "m"),
+        SignalField::new("closed", FieldType::Bool, ""),
+        SignalField::new("task", FieldType::Text, ""),
+    ];
+    SignalRecord::new(&Arc::new(SignalDescription::fields(name(id), fields).unwrap()))
+}
+
+/// Samples of one signal in a set.
+pub const SIGNAL_SAMPLES: u64 = 5;
+
+/// Sample number `k` of a signal, counted from 0; now and then a value is NaN.
+pub fn signal_sample(record: &SignalRecord, k: u64) -> SignalSample {
+    let time_ns = M0 + k as i64 * (PERIOD / SIGNAL_SAMPLES as i64);
+    let x = if k % 7 == 6 { f64::NAN } else { k as f64 / 8.0 };
+    let mut values = x.to_le_bytes().to_vec();
+    if record.description.has_text() {
+        let task = format!("put \"cup\" {k} on it \u{1f375}\n");
+        values.extend([u8::from(k.is_multiple_of(2)), 0, 0, 0]);
+        values.extend((task.len() as u32).to_le_bytes());
+        values.extend(task.as_bytes());
+    } else {
+        values.extend((-x).to_le_bytes());
+    }
+    let header = SignalHeader {
+        sequence: k + 1,
+        session: 77,
+        time_ns,
+        publish_time_ns: time_ns + 900,
+        uncertainty_ns: 1000,
+        description_hash: record.description.hash(),
+        ..SignalHeader::default()
+    };
+    SignalSample::new(header, &record.description, values).unwrap()
+}
+
+/// What the signals publish between set `n` and the one before.
+pub fn signals(session: &Session, n: u64) -> Vec<RecordSignal> {
+    let samples = |record| {
+        let numbers = n * SIGNAL_SAMPLES..(n + 1) * SIGNAL_SAMPLES;
+        numbers.map(|k| signal_sample(record, k)).collect()
+    };
+    let part = |(signal, record)| RecordSignal { signal, samples: samples(record) };
+    session.signals.iter().enumerate().map(part).collect()
 }
 
 /// Smooth images with an edge, as a camera gives them, different for each set.
@@ -180,7 +240,7 @@ pub fn set_of(session: &Session, n: u64, streams: &[usize]) -> RecordSet {
         tick: HostTime::from_ns(M0 + n as i64 * PERIOD),
         utc: UtcPair { mono: HostTime::from_ns(M0), utc_ns: T0, width_ns: 100 },
         motion: motion(session, n),
-        signals: Vec::new(),
+        signals: signals(session, n),
         spread_ns: times.iter().max().unwrap_or(&0) - times.iter().min().unwrap_or(&0),
         missing: (0..session.streams.len()).filter(|i| !streams.contains(i)).collect(),
         frames,

@@ -562,15 +562,15 @@ fn a_recovered_segment_says_what_it_lost_alone_and_the_dataset_says_it_once() {
     let parts = |f: &Finding| (f.severity, f.file.clone(), f.message.clone());
     let expected: Vec<_> =
         words.iter().map(|w| (Severity::Lost, "seg_0000.mcap".to_owned(), w.clone())).collect();
-    // Lost sets lose their IMU batches, which the numbers around them show.
-    let (motion, of_sets): (Vec<_>, Vec<_>) =
+    // Lost sets lose their IMU batches and samples of signals, which the numbers around them show.
+    let (beside, of_sets): (Vec<_>, Vec<_>) =
         alone.findings.iter().partition(|f| f.severity == Severity::Note);
     assert_eq!(of_sets.into_iter().map(parts).collect::<Vec<_>>(), expected);
-    let motion: Vec<_> = motion.iter().map(|f| f.message.as_str()).collect();
-    assert_eq!(
-        motion,
-        ["front/imu", "side/imu"].map(|u| format!("{BATCHES} batches of {u} were not recorded"))
-    );
+    let beside: Vec<_> = beside.iter().map(|f| f.message.as_str()).collect();
+    let batches = ["front/imu", "side/imu"].map(|u| format!("{BATCHES} batches of {u} were not recorded"));
+    let samples =
+        ["arm/gripper", "arm/joints"].map(|s| format!("{SIGNAL_SAMPLES} samples of {s} were not recorded"));
+    assert_eq!(beside, [batches, samples].concat());
     let whole = check(&fs, &VerifyOptions::default()).findings;
     for what in words {
         assert_eq!(whole.iter().filter(|f| f.message == *what).count(), 1, "{whole:?}");
