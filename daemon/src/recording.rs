@@ -235,6 +235,7 @@ impl Recording {
     pub fn begin(&mut self, begun: Begun) -> RecordingStatus {
         let active = self.active.insert(begun.0);
         active.motion.begin();
+        self.signals.begin(&mut active.signals, &active.recorder);
         active.refresh();
         self.summary = None;
         self.losses = LossHistory::default();

@@ -5,14 +5,25 @@
 //! with other fields is not, until the next recording: the fields of a channel stay the same over a dataset.
 
 use super::waiting::Waiting;
-use depthrig_bus::{DropCounts, DropReason, SignalSample, StreamId};
+use depthrig_bus::{DropCounts, DropReason, HostTime, SignalSample, StreamId};
 use depthrig_recorder::{RecordSignal, Recorder, SET_SIGNALS_MAX_BYTES, SignalRecord, StreamAccount};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
+
+/// A recording begins with the samples of so long before: the first set has a moment before the recording began.
+const BEFORE_NS: i64 = 1_000_000_000;
+/// So many of a signal at most.
+const BEFORE_SAMPLES: usize = 512;
 
 /// The signals that are published now, as far as a sample of them was read.
 #[derive(Default)]
-pub(super) struct Known(BTreeMap<StreamId, SignalRecord>);
+pub(super) struct Known(BTreeMap<StreamId, Published>);
+
+struct Published {
+    record: SignalRecord,
+    /// The last samples while nothing is recorded.
+    before: VecDeque<SignalSample>,
+}
 
 impl Known {
     /// Takes in samples of the signal `id`, before which `missed` were replaced on the channel; they go to the recording, if
@@ -26,13 +37,28 @@ impl Known {
     ) {
         if let Some(newest) = samples.last() {
             let description = newest.description();
-            let is_known = self.0.get(id).is_some_and(|r| Arc::ptr_eq(&r.description, description));
+            let is_known = self.0.get(id).is_some_and(|p| Arc::ptr_eq(&p.record.description, description));
             if !is_known {
-                self.0.insert(id.clone(), SignalRecord::new(description));
+                let record = SignalRecord::new(description);
+                self.0.insert(id.clone(), Published { record, before: VecDeque::new() });
             }
         }
         if let Some((signals, recorder)) = recording {
             signals.hear(recorder, id, samples, missed);
+        } else if let Some(Published { record, before }) = self.0.get_mut(id) {
+            before.extend(samples.into_iter().filter(|s| *s.description() == record.description));
+            before.drain(..before.len().saturating_sub(BEFORE_SAMPLES));
+        }
+    }
+
+    /// Hands the samples of the last second, and the last one however old, to a recording that begins.
+    pub(super) fn begin(&mut self, signals: &mut Signals, recorder: &Recorder) {
+        let since = HostTime::now().plus_ns(-BEFORE_NS);
+        for (id, Published { before, .. }) in &mut self.0 {
+            let last = before.len().saturating_sub(1);
+            let old = before.iter().take(last).take_while(|s| s.time() < since).count();
+            let samples = before.drain(..).skip(old).collect();
+            signals.hear(recorder, id, samples, 0);
         }
     }
 
@@ -43,7 +69,7 @@ impl Known {
 
     /// All of them.
     pub(super) fn records(&self) -> Vec<SignalRecord> {
-        self.0.values().cloned().collect()
+        self.0.values().map(|p| p.record.clone()).collect()
     }
 }
 

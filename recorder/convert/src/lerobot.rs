@@ -14,7 +14,7 @@ mod schema;
 mod stats;
 mod table;
 
-use super::{EpisodeUse, Exporter, Output, Part, PartOut, PartSets, Parts, Plan, Source};
+use super::{EpisodeUse, Exporter, Output, Part, PartOut, PartSets, Parts, Plan, Source, VectorOptions};
 use depthrig_bus::StreamId;
 use depthrig_recorder::{Error, ErrorKind, Result};
 use serde::Serialize;
@@ -42,6 +42,8 @@ pub struct LerobotOptions {
     pub incomplete: Incomplete,
     /// The streams to export; none means all.
     pub streams: Vec<StreamId>,
+    /// The signals that become `observation.state` and `action`.
+    pub signals: VectorOptions,
 }
 
 /// The exporter to LeRobot v3.0.

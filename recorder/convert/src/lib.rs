@@ -29,6 +29,7 @@ mod run_part;
 pub mod scenes;
 mod source;
 pub mod store;
+mod vectors;
 pub mod zed_replay;
 
 pub use bytecamera::{ByteCameraExport, ByteCameraImport, ByteCameraOptions, CameraNames};
@@ -39,3 +40,4 @@ pub use report::{DatasetIdentity, ExportReport, PartRecord, REPORT_FILE, Segment
 pub use rosbag::RosbagImport;
 pub use run_part::RunPart;
 pub use source::{EpisodeUse, PART_SETS, Part, Source};
+pub use vectors::{Gaps, VectorOptions};

@@ -290,9 +290,10 @@ impl SignalInfo {
     }
 }
 
-pub(super) fn gather(dataset: &Dataset) -> Result<DatasetInfo> {
+/// What the session says, before anything is counted.
+fn uncounted(dataset: &Dataset) -> DatasetInfo {
     let session = dataset.session();
-    let mut info = DatasetInfo {
+    DatasetInfo {
         path: dataset.path().to_owned(),
         name: session.name.clone(),
         rig: session.rig.clone(),
@@ -308,7 +309,7 @@ pub(super) fn gather(dataset: &Dataset) -> Result<DatasetInfo> {
         unfinished: Vec::new(),
         problems: Vec::new(),
         spread: SpreadStats::default(),
-        streams: Vec::new(),
+        streams: session.streams.iter().map(StreamInfo::new).collect(),
         motion: Vec::new(),
         signals: Vec::new(),
         computed: session.computed.clone(),
@@ -316,8 +317,12 @@ pub(super) fn gather(dataset: &Dataset) -> Result<DatasetInfo> {
         history: session.history.clone(),
         set_counts: None,
         accounts: Vec::new(),
-    };
-    info.streams.extend(session.streams.iter().map(StreamInfo::new));
+    }
+}
+
+pub(super) fn gather(dataset: &Dataset) -> Result<DatasetInfo> {
+    let session = dataset.session();
+    let mut info = uncounted(dataset);
     let mut spreads = Vec::new();
     let mut ticks = None;
     let mut units = vec![MotionCount::default(); session.motion.len()];

@@ -23,7 +23,7 @@ const DATA_PATH: &str = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parq
 struct Whole {
     bytes: u64,
     file: usize,
-    /// By feature and by number column; none where nothing was seen.
+    /// By feature, by number column and by vector; none where nothing was seen.
     stats: Vec<Option<Stats>>,
 }
 
@@ -31,7 +31,7 @@ struct Whole {
 pub(super) fn finish(plan: &Plan, sources: &[Source], parts: &Parts<'_>, out: &Output<'_>) -> Result<()> {
     let mut episodes = Vec::with_capacity(plan.episodes.len());
     for source in 0..sources.len() {
-        episodes.push(gather(plan, source, parts)?);
+        episodes.push(gather(plan, sources, source, parts)?);
     }
     place(&mut episodes);
     for file in 0..episodes.last().map_or(0, |e| e.file + 1) {
@@ -41,7 +41,7 @@ pub(super) fn finish(plan: &Plan, sources: &[Source], parts: &Parts<'_>, out: &O
 }
 
 /// Adds up what is known of an episode's parts.
-fn gather(plan: &Plan, source: usize, parts: &Parts<'_>) -> Result<Whole> {
+fn gather(plan: &Plan, sources: &[Source], source: usize, parts: &Parts<'_>) -> Result<Whole> {
     let schema = &plan.schema;
     let numbers = schema.numbers();
     let mut images = vec![ImageStats::default(); schema.features.len()];
@@ -58,7 +58,14 @@ fn gather(plan: &Plan, source: usize, parts: &Parts<'_>) -> Result<Whole> {
     }
     let of_images = images.iter().zip(&schema.features).map(|(s, f)| s.finish(f.divisor()));
     let of_columns = columns.iter().zip(&numbers).map(|(s, (name, _))| s.finish(Schema::ordered(name)));
-    Ok(Whole { bytes, file: 0, stats: of_images.chain(of_columns).collect() })
+    let episode = &plan.episodes[source];
+    let numbers = sources[source].numbers().filter(|n| episode.row_of(*n).is_some());
+    let numbers: Vec<_> = numbers.collect();
+    let of_vectors = (0..schema.vectors.len()).map(|v| {
+        let rows = numbers.iter().filter_map(|n| episode.moments.row(v, *n)).filter(|r| !r.is_missing);
+        Stats::of_vectors(&rows.map(|r| r.values.as_slice()).collect::<Vec<_>>())
+    });
+    Ok(Whole { bytes, file: 0, stats: of_images.chain(of_columns).chain(of_vectors).collect() })
 }
 
 /// Decides which file each episode goes into: a file is full when the next episode would exceed the limit. An
@@ -138,10 +145,12 @@ fn metadata(plan: &Plan, sources: &[Source], out: &Output<'_>, episodes: &[Whole
     write_json(out, "meta/info.json", &info(plan, sources))
 }
 
-/// Features, then number columns: the order of `Whole::stats`.
+/// Features, number columns and vectors: the order of `Whole::stats`.
 fn column_names(plan: &Plan) -> Vec<String> {
     let images = plan.schema.features.iter().map(Feature::key);
-    images.chain(plan.schema.numbers().into_iter().map(|(name, _)| name)).collect()
+    let numbers = plan.schema.numbers().into_iter().map(|(name, _)| name);
+    let vectors = plan.schema.vectors.iter().map(|v| v.key.to_owned());
+    images.chain(numbers).chain(vectors).collect()
 }
 
 #[derive(Serialize)]

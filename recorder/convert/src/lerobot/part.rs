@@ -104,6 +104,8 @@ struct Rows<'p, 'f> {
     images: Vec<(Vec<ByteArray>, Vec<ByteArray>)>,
     /// By column of `Schema::numbers`.
     numbers: Vec<Vec<Number>>,
+    /// By vector.
+    vectors: Vec<Vec<Vec<f32>>>,
     group_bytes: usize,
     /// A blank image of each feature, made when it is needed first.
     blanks: Vec<Option<(ByteArray, &'static str)>>,
@@ -121,6 +123,7 @@ impl<'p, 'f> Rows<'p, 'f> {
             table,
             images: vec![(Vec::new(), Vec::new()); features],
             numbers: vec![Vec::new(); numbers],
+            vectors: vec![Vec::new(); plan.schema.vectors.len()],
             group_bytes: 0,
             blanks: vec![None; features],
             info: PartInfo {
@@ -143,7 +146,7 @@ impl<'p, 'f> Rows<'p, 'f> {
         for feature in 0..self.images.len() {
             self.blank(feature, row)?;
         }
-        self.end_row(row, &facts, &vec![None; self.images.len()])
+        self.end_row(row, number, &facts, &vec![None; self.images.len()])
     }
 
     fn set(
@@ -181,7 +184,7 @@ impl<'p, 'f> Rows<'p, 'f> {
                 }
             }
         }
-        self.end_row(row, &SetFacts::of(set), &captures)
+        self.end_row(row, number, &SetFacts::of(set), &captures)
     }
 
     fn blank(&mut self, feature: usize, row: u64) -> Result<()> {
@@ -203,8 +206,8 @@ impl<'p, 'f> Rows<'p, 'f> {
         names.push(text(format!("frame-{row:06}.{extension}")));
     }
 
-    /// The numbers of a row, in the order of `Schema::numbers`.
-    fn end_row(&mut self, row: u64, facts: &SetFacts, captures: &[Option<i64>]) -> Result<()> {
+    /// The numbers of a row, in the order of `Schema::numbers`, and its vectors.
+    fn end_row(&mut self, row: u64, number: usize, facts: &SetFacts, captures: &[Option<i64>]) -> Result<()> {
         let fixed = [
             // The loader works in floats, and computes the grid as this quotient.
             Number::Float((row as f64 / self.plan.fps) as f32),
@@ -218,12 +221,21 @@ impl<'p, 'f> Rows<'p, 'f> {
         ];
         let times = captures.iter().map(|c| c.map_or(Number::None, Number::Int));
         let missing = captures.iter().map(|c| Number::Bool(c.is_none()));
-        let values = fixed.into_iter().chain(times).chain(missing);
+        let schema = &self.plan.schema;
+        let moments = &self.episode.moments;
+        let masks = schema.masks().enumerate();
+        let masks = masks.map(|(v, _)| Number::Bool(moments.row(v, number).is_none_or(|r| r.is_missing)));
+        let is_last = row + 1 == self.episode.rows;
+        let success = schema.is_judged().then_some(Number::Bool(is_last && self.episode.is_success));
+        let values = fixed.into_iter().chain(times).chain(missing).chain(masks).chain(success);
         for ((column, stats), value) in self.numbers.iter_mut().zip(&mut self.info.numbers).zip(values) {
             if !matches!(value, Number::None) {
                 stats.add(value.value(), row, self.episode.rows);
             }
             column.push(value);
+        }
+        for (v, rows) in self.vectors.iter_mut().enumerate() {
+            rows.push(moments.row(v, number).map(|r| r.values.clone()).unwrap_or_default());
         }
         self.info.rows += 1;
         if self.group_bytes >= ROW_GROUP_BYTES { self.end_group() } else { Ok(()) }
@@ -233,12 +245,16 @@ impl<'p, 'f> Rows<'p, 'f> {
         if self.numbers.first().is_none_or(Vec::is_empty) {
             return Ok(());
         }
-        let mut values = Vec::with_capacity(self.images.len() + self.numbers.len());
+        let mut values = Vec::with_capacity(self.images.len() + self.numbers.len() + self.vectors.len());
         for (bytes, paths) in &mut self.images {
             values.push(Values::Image { bytes: std::mem::take(bytes), paths: std::mem::take(paths) });
         }
         for ((_, kind), column) in self.plan.schema.numbers().iter().zip(&mut self.numbers) {
             values.push(column_values(*kind, &std::mem::take(column)));
+        }
+        for rows in self.vectors.iter_mut().map(std::mem::take) {
+            let is_single = rows.iter().all(|r| r.len() == 1);
+            values.push(if is_single { Values::Float32(rows.concat()) } else { Values::Floats(rows) });
         }
         self.group_bytes = 0;
         self.table.rows(&values)

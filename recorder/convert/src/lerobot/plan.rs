@@ -3,8 +3,9 @@
 use super::schema::Schema;
 use super::{Incomplete, LerobotOptions};
 use crate::Source;
+use crate::vectors::Moments;
 use depthrig_bus::StreamId;
-use depthrig_recorder::PixelMode;
+use depthrig_recorder::{EpisodeOutcome, PixelMode};
 use depthrig_recorder::{Error, ErrorKind, Result};
 use std::collections::BTreeMap;
 
@@ -30,6 +31,10 @@ pub(super) struct Episode {
     first: usize,
     /// Numbers of its sets that are left out, in order.
     left_out: Vec<usize>,
+    /// State and action at its sets.
+    pub(super) moments: Moments,
+    /// Somebody judged that its task was done.
+    pub(super) is_success: bool,
 }
 
 impl Episode {
@@ -112,17 +117,32 @@ impl Plan {
                 return Err(bad(format!("there is no stream {id} to export, at least not in every dataset")));
             }
         }
-        let schema = Schema::of(sources, &wanted)?;
+        let schema = Schema::of(sources, &wanted, &options.signals)?;
         let losses = schema.losses();
         let mut plan = Self { schema, fps: 0.0, episodes: Vec::new(), tasks: Vec::new(), losses };
         let mut fps = None;
         let mut first_row = 0;
         for source in sources {
             let name = source.dataset().path().display();
-            let left_out = match options.incomplete {
+            let session = named(source);
+            let moments = Moments::read(source, &plan.schema.vectors, &options.signals)?;
+            let mut left_out = match options.incomplete {
                 Incomplete::Mark => Vec::new(),
                 Incomplete::LeaveOut => incomplete(source, &plan.schema)?,
             };
+            if !left_out.is_empty() {
+                let n = left_out.len();
+                plan.losses.push(format!("{session}: {n} sets that lack a frame are left out"));
+            }
+            if !moments.left_out.is_empty() {
+                let n = moments.left_out.len();
+                plan.losses.push(format!(
+                    "{session}: {n} sets before or after the samples of a signal are left out"
+                ));
+                left_out.extend(&moments.left_out);
+                left_out.sort_unstable();
+                left_out.dedup();
+            }
             let rows = (source.numbers().count() - left_out.len()) as u64;
             if rows == 0 {
                 return Err(bad(format!("{name}: there is no set to export in it")));
@@ -133,7 +153,8 @@ impl Plan {
                 plan.tasks.len() - 1
             });
             let first = source.numbers().next().unwrap_or_default();
-            let episode = Episode { task, first_row, rows, first, left_out };
+            let is_success = source.episode().is_some_and(|e| e.outcome == Some(EpisodeOutcome::Success));
+            let episode = Episode { task, first_row, rows, first, left_out, moments, is_success };
             let times = source.times();
             let kept = steps(source.numbers().filter(|n| episode.row_of(*n).is_some()).map(|n| times[n]));
             // An episode may have too few sets to know a rate from.
@@ -145,12 +166,6 @@ impl Plan {
                     "{name} has {here} sets per second, the first dataset {fps}: LeRobot has one rate for all \
                      episodes; export them separately or give the rate"
                 )));
-            }
-            let number = source.episode().map(|e| format!(" episode {}", e.number)).unwrap_or_default();
-            let session = format!("{}{number}", source.session().name);
-            if !episode.left_out.is_empty() {
-                let n = episode.left_out.len();
-                plan.losses.push(format!("{session}: {n} sets that lack a frame are left out"));
             }
             let (gaps, missing) = gaps(&kept, fps);
             if gaps > 0 {
@@ -170,6 +185,12 @@ impl Plan {
     pub(super) fn rows(&self) -> u64 {
         self.episodes.iter().map(|e| e.rows).sum()
     }
+}
+
+/// The name of a source for a person.
+fn named(source: &Source) -> String {
+    let number = source.episode().map(|e| format!(" episode {}", e.number)).unwrap_or_default();
+    format!("{}{number}", source.session().name)
 }
 
 /// LeRobot's task is a sentence: that of the episode; else the scene is the nearest that a session has.

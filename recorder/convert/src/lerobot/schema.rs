@@ -2,9 +2,10 @@
 
 use super::encode::Form;
 use super::table::{Kind, Layout};
-use crate::Source;
+use crate::vectors::Vector;
+use crate::{Gaps, Source, VectorOptions};
 use depthrig_bus::{PixelFormat, StreamId};
-use depthrig_recorder::{Error, ErrorKind, Result, Session, StreamRecord};
+use depthrig_recorder::{Error, ErrorKind, Result, Session, SignalRecord, StreamRecord};
 use serde::Serialize;
 use serde::ser::Serializer;
 use serde_json::{Value, json};
@@ -68,7 +69,15 @@ impl Feature {
 #[derive(Debug, Clone)]
 pub(super) struct Schema {
     pub(super) features: Vec<Feature>,
+    /// The robot's state and action, as far as there are signals for them.
+    pub(super) vectors: Vec<Vector>,
+    options: VectorOptions,
+    /// Some episode was judged.
+    is_judged: bool,
 }
+
+/// The column that says where a judged task was done: in the last row of an episode that succeeded.
+const SUCCESS: &str = "next.success";
 
 fn bad(message: String) -> Error {
     Error::new(ErrorKind::BadInput, message)
@@ -76,7 +85,11 @@ fn bad(message: String) -> Error {
 
 impl Schema {
     /// The streams that all datasets have, which must be the same; those that `wanted` refuses are left out.
-    pub(super) fn of(sources: &[Source], wanted: &dyn Fn(&StreamId) -> bool) -> Result<Self> {
+    pub(super) fn of(
+        sources: &[Source],
+        wanted: &dyn Fn(&StreamId) -> bool,
+        options: &VectorOptions,
+    ) -> Result<Self> {
         let first = sources.first().ok_or_else(|| bad("there is no dataset to export".to_owned()))?;
         let mut features = Vec::<Feature>::new();
         for s in first.session().streams.iter().filter(|s| wanted(&s.id)) {
@@ -104,7 +117,9 @@ impl Schema {
         for other in &sources[1..] {
             same_streams(first, other, wanted)?;
         }
-        Ok(Self { features })
+        let vectors = Vector::choose(sources, options, ["observation.state", "action"])?;
+        let is_judged = sources.iter().any(|s| s.episode().is_some_and(|e| e.outcome.is_some()));
+        Ok(Self { features, vectors, options: options.clone(), is_judged })
     }
 
     /// For each stream of a dataset its feature, if it is exported.
@@ -129,15 +144,45 @@ impl Schema {
                 f.key()
             ));
         }
+        for v in &self.vectors {
+            losses.push(format!("{}: {}", v.key, self.rule()));
+            let has_text = |s: &&SignalRecord| s.description.has_text();
+            losses.extend(v.signals().filter(has_text).map(|s| format!("{}: texts are left out", s.id)));
+        }
         losses
     }
 
-    /// Name and kind of every column that is not an image, in the order of the rows' values.
+    /// How the values of signals at a set come about, in words.
+    fn rule(&self) -> String {
+        let max_gap_s = self.options.max_gap_ns as f64 / 1e9;
+        let gaps = match self.options.gaps {
+            Gaps::Refuse => "",
+            Gaps::Mask => "; elsewhere the last value is held, and missing.* is true",
+        };
+        format!(
+            "32-bit floats at the tick of each set (capture.utc_ns): on a line between samples at most {max_gap_s} s apart, \
+             rotations on the shorter arc, integers and bools of the sample before{gaps}"
+        )
+    }
+
+    /// Name and kind of every column of one number, in the order of the rows' values.
     pub(super) fn numbers(&self) -> Vec<(String, Kind)> {
         let fixed = PRESCRIBED.iter().chain(&PER_SET).map(|(name, kind)| ((*name).to_owned(), *kind));
         let capture = self.features.iter().map(|f| (f.capture_key(), Kind::Int64));
         let missing = self.features.iter().map(|f| (f.missing_key(), Kind::Bool));
-        fixed.chain(capture).chain(missing).collect()
+        let masks = self.masks().map(|v| (format!("missing.{}", v.key), Kind::Bool));
+        let success = self.is_judged.then(|| (SUCCESS.to_owned(), Kind::Bool));
+        fixed.chain(capture).chain(missing).chain(masks).chain(success).collect()
+    }
+
+    /// The vectors that have a column for their gaps.
+    pub(super) fn masks(&self) -> impl Iterator<Item = &Vector> {
+        self.vectors.iter().filter(|_| self.options.gaps == Gaps::Mask)
+    }
+
+    /// Whether there is a column for success.
+    pub(super) const fn is_judged(&self) -> bool {
+        self.is_judged
     }
 
     /// Whether the values of a number column never fall within an episode.
@@ -145,13 +190,18 @@ impl Schema {
         PRESCRIBED.iter().any(|(n, _)| *n == name) || name == "capture.utc_ns" || name == "capture.set_id"
     }
 
-    /// The data table: images, then numbers.
+    /// The data table: images, then numbers, then vectors.
     pub(super) fn layout(&self) -> Layout {
         let images = self.features.iter().map(|f| {
             // JPEG and PNG are packed already.
             (f.key(), Kind::Image { packed: f.form.is_depth() })
         });
-        let columns: Vec<_> = images.chain(self.numbers()).collect();
+        // LeRobot stores a vector of one number as that number.
+        let vectors = self.vectors.iter().map(|v| {
+            let length = v.names().len();
+            (v.key.to_owned(), if length == 1 { Kind::Float32 } else { Kind::Floats { length } })
+        });
+        let columns: Vec<_> = images.chain(self.numbers()).chain(vectors).collect();
         let features: Ordered<Value> = Ordered(
             columns
                 .iter()
@@ -161,6 +211,9 @@ impl Schema {
                         Kind::Image { .. } => json!({ "_type": "Image" }),
                         Kind::Bool => dtype("bool"),
                         Kind::Float32 => dtype("float32"),
+                        Kind::Floats { length } => {
+                            json!({ "feature": dtype("float32"), "length": length, "_type": "Sequence" })
+                        }
                         _ => dtype("int64"),
                     };
                     (name.clone(), value)
@@ -191,6 +244,13 @@ impl Schema {
                 _ => "int64",
             };
             out.push((name, json!({ "dtype": dtype, "shape": [1], "names": null })));
+        }
+        for v in &self.vectors {
+            let names = v.names();
+            let signals: Vec<_> = v.signals().map(|s| s.id.to_string()).collect();
+            let info = json!({ "depthrig.signals": signals, "depthrig.interpolation": self.rule() });
+            let feature = json!({ "dtype": "float32", "shape": [names.len()], "names": names, "info": info });
+            out.push((v.key.to_owned(), feature));
         }
         Ordered(out)
     }

@@ -265,6 +265,37 @@ fn quantile_row(q: f64, rows: u64) -> u64 {
 }
 
 impl Stats {
+    /// Those of each element of vectors, which are all there at once: a quantile lies on a line between two of them, as
+    /// NumPy's does. `None` without a vector.
+    pub(super) fn of_vectors(rows: &[&[f32]]) -> Option<Self> {
+        let n = rows.len() as f64;
+        let elements: Vec<Vec<f64>> = (0..rows.first()?.len())
+            .map(|i| {
+                let mut values: Vec<_> = rows.iter().map(|r| f64::from(r[i])).collect();
+                values.sort_by(f64::total_cmp);
+                values
+            })
+            .collect();
+        let each = |f: &dyn Fn(&[f64]) -> f64| elements.iter().map(|v| f(v)).collect::<Vec<_>>();
+        let mean_of = |v: &[f64]| v.iter().sum::<f64>() / n;
+        let quantile_of = |v: &[f64], q: f64| {
+            let at = q * (n - 1.0);
+            let low = v[at.floor() as usize];
+            low + (v[at.ceil() as usize] - low) * at.fract()
+        };
+        Some(Self {
+            count: rows.len() as u64,
+            min: each(&|v| v[0]),
+            max: each(&|v| v[v.len() - 1]),
+            mean: each(&mean_of),
+            std: each(&|v| {
+                let mean = mean_of(v);
+                (v.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / n).sqrt()
+            }),
+            quantiles: QUANTILES.iter().map(|(_, q)| each(&|v| quantile_of(v, *q))).collect(),
+        })
+    }
+
     /// One set of statistics from those of all episodes, weighted by count, as LeRobot aggregates them.
     pub(super) fn aggregate(all: &[&Self]) -> Option<Self> {
         let first = all.first()?;

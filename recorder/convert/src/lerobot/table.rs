@@ -30,6 +30,10 @@ pub(super) enum Kind {
     },
     /// List of text, not null.
     TextList,
+    /// List of so many floats, not null.
+    Floats {
+        length: usize,
+    },
     /// Lists within lists of doubles, this deep; null without values.
     Doubles {
         depth: u8,
@@ -50,6 +54,7 @@ pub(super) enum Values {
         paths: Vec<ByteArray>,
     },
     TextList(Vec<Vec<ByteArray>>),
+    Floats(Vec<Vec<f32>>),
     /// Per row: the values along the outermost list; the lists within hold one each.
     Doubles(Vec<Option<Vec<f64>>>),
     Int64List(Vec<Option<Vec<i64>>>),
@@ -103,6 +108,7 @@ impl Layout {
                     Arc::new(group.with_fields(vec![bytes, path]).build()?)
                 }
                 Kind::TextList => list(name, leaf("element", Physical::BYTE_ARRAY, true)?)?,
+                Kind::Floats { .. } => list(name, leaf("element", Physical::FLOAT, false)?)?,
                 Kind::Int64List => list(name, leaf("element", Physical::INT64, false)?)?,
                 Kind::Doubles { depth } => {
                     let mut element = leaf("element", Physical::DOUBLE, false)?;
@@ -282,6 +288,9 @@ fn write_group(
             Values::TextList(rows) => {
                 let rows = rows.iter().map(|r| Some(r.as_slice()));
                 lists::<ByteArrayType>(&mut group, rows)?;
+            }
+            Values::Floats(rows) => {
+                lists::<FloatType>(&mut group, rows.iter().map(|r| Some(r.as_slice())))?;
             }
             Values::Int64List(rows) => {
                 lists::<Int64Type>(&mut group, rows.iter().map(Option::as_deref))?;

@@ -4,7 +4,7 @@ use crate::dataset::SignalCount;
 use crate::report::series::{TimeBins, Values};
 use crate::report::{FieldSeries, SignalReport};
 use crate::{SignalRecord, StreamAccount};
-use depthrig_bus::SignalSample;
+use depthrig_bus::{SignalSample, Value};
 
 /// Elements that are plotted: beyond these a plot is unreadable.
 const PLOTTED: usize = 16;
@@ -37,7 +37,7 @@ impl Signal {
         self.count.take(samples);
         for sample in samples {
             let at = sample.header().time_ns.saturating_add(offset_ns);
-            for (values, x) in self.values.iter_mut().zip(sample.values().filter_map(|v| v.number())) {
+            for (values, x) in self.values.iter_mut().zip(sample.values().filter_map(Value::number)) {
                 if x.is_finite() {
                     values.add(bins, at, x);
                 }

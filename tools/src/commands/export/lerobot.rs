@@ -4,6 +4,7 @@ use super::Common;
 use clap::ValueEnum;
 use depthrig_bus::StreamId;
 use depthrig_convert::lerobot::{Incomplete, Lerobot, LerobotOptions};
+use depthrig_convert::{Gaps, VectorOptions};
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
@@ -33,6 +34,27 @@ pub struct Args {
     /// Export only this stream; repeatable
     #[arg(long = "stream", value_name = "CAMERA/STREAM")]
     streams: Vec<StreamId>,
+    /// Put this signal into observation.state; repeatable [default: all but actions]
+    #[arg(long, value_name = "DEVICE/SIGNAL")]
+    state: Vec<StreamId>,
+    /// Put this signal into action; repeatable [default: those named action or action_…]
+    #[arg(long, value_name = "DEVICE/SIGNAL")]
+    action: Vec<StreamId>,
+    /// Longest distance of two samples to interpolate between
+    #[arg(long, value_name = "TIME", default_value = "0.2s", value_parser = crate::args::duration_s)]
+    max_gap: f64,
+    /// Handling of longer gaps
+    #[arg(long, value_enum, default_value = "refuse", value_name = "HOW")]
+    gaps: HowGaps,
+}
+
+/// Handling of gaps in signals.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum HowGaps {
+    /// Export nothing, and say where they are
+    Refuse,
+    /// Hold the last value, marked as missing
+    Mask,
 }
 
 /// Handling of sets that lack a frame.
@@ -55,6 +77,15 @@ impl Args {
                 HowIncomplete::LeaveOut => Incomplete::LeaveOut,
             },
             streams: self.streams.clone(),
+            signals: VectorOptions {
+                state: self.state.clone(),
+                action: self.action.clone(),
+                max_gap_ns: (self.max_gap * 1e9) as u64,
+                gaps: match self.gaps {
+                    HowGaps::Refuse => Gaps::Refuse,
+                    HowGaps::Mask => Gaps::Mask,
+                },
+            },
         };
         (Lerobot::new(options), &self.common)
     }
