@@ -50,6 +50,7 @@ fn read(r: &Reader<'_>) -> SyntheticConfig {
         gain: field(s, "gain", d.gain, |c, v| c.gain = v),
         ring_frames: field(s, "ring_frames", d.ring_frames, |c, v| c.ring_frames = v),
         board: s.has("board").then(|| board(s, r.base)),
+        arm: field(s, "arm", d.arm, |c, v| c.arm = v),
     };
     for wanted in streams {
         let StreamRequest { stream, size, rate_hz, .. } = wanted.request.clone();

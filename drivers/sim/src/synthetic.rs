@@ -6,6 +6,7 @@
 //! streaming costs one memory copy per frame. Clocks, transport and faults are simulated as [`SyntheticConfig`] says
 //! and pass through the same [`depthrig_driver::Gate`] as those of a real device; [`SimTruth`] knows what really happened.
 
+pub mod arm;
 mod backend;
 pub mod board;
 mod cache;

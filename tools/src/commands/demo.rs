@@ -17,13 +17,14 @@ use depthrig_bus::{Bus, HostTime, Name, RuntimeDir, StreamId, UtcPair};
 use depthrig_cdm::Precision;
 use depthrig_cdm::stage::{EngineChoice, RefineConfig};
 use depthrig_daemon::config::{CameraConfig, RigConfig};
-use depthrig_daemon::control::RecordRequest;
+use depthrig_daemon::control::{EpisodeRequest, RecordRequest};
 use depthrig_daemon::rig::{Rig, RigSummary};
 use depthrig_daemon::status::{CameraStatus, RigStatus};
 use depthrig_driver::StreamRequest;
 use depthrig_recorder::report::REPORT_FILE;
-use depthrig_recorder::{Dataset, VerifyOptions, verify};
+use depthrig_recorder::{Dataset, EpisodeOutcome, VerifyOptions, verify};
 use depthrig_sim::synthetic::SyntheticConfig;
+use depthrig_sim::synthetic::arm::ArmSignals;
 use depthrig_stereo::Mode;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -146,6 +147,7 @@ fn configuration(file: Option<&Path>) -> Result<Chosen> {
     for camera in &mut config.cameras {
         if let Some(settings) = camera.backend.settings_mut::<SyntheticConfig>() {
             settings.truth = true;
+            settings.arm = true;
             // If the rig lists streams, add the ground truth of each in the same mode.
             for (of, truth) in [("depth", "depth_true"), ("color", "depth_true_color")] {
                 if let Some(mode) = camera.streams.iter().find(|s| s.stream.as_str() == of).cloned() {
@@ -254,6 +256,8 @@ fn record(
         let watcher = Watcher::new(&bus, &streams)?;
         let ended = &ended;
         let watching = scope.spawn(move || watcher.run(|| ended.load(Ordering::Relaxed)));
+        let mut arm = ArmSignals::new(runtime)?;
+        let moving = scope.spawn(move || arm.run(|| ended.load(Ordering::Relaxed)));
         let recording = || -> Result<RigStatus> {
             let request = RecordRequest {
                 directory: Some(folder.to_owned()),
@@ -263,7 +267,11 @@ fn record(
                 ..RecordRequest::default()
             };
             control.record_start(&request)?;
+            control.episode(&EpisodeRequest::Start {
+                task: "carry nothing from the ball to the plate".into(),
+            })?;
             show_recording(args.seconds, stop, quiet);
+            control.episode(&EpisodeRequest::Stop { outcome: Some(EpisodeOutcome::Success) })?;
             let live = control.status();
             control.record_stop()?;
             Ok(live)
@@ -271,6 +279,7 @@ fn record(
         let live = recording();
         ended.store(true, Ordering::Relaxed);
         let seen = watching.join().map_err(|_| anyhow!("the subscriber of the demo panicked"))?;
+        moving.join().map_err(|_| anyhow!("the robot of the demo panicked"))??;
         Ok((live?, seen?))
     })?;
     if stop.is_asked() {

@@ -11,7 +11,7 @@ use super::queue::{Queue, Waiting};
 use super::render::{self, Images};
 use super::unit::{DueFault, SimFrame, SimTruth, Unit};
 use super::view::Rays;
-use super::{NAME, motion, noise, overlay};
+use super::{NAME, noise, overlay};
 use core::sync::atomic::Ordering;
 use core::time::Duration;
 use depthrig_bus::{DropReason, FrameFlags, HostTime};
@@ -301,8 +301,7 @@ impl SyntheticStream {
         let unit = &self.hold.0;
         let stream = &mut self.streams[i];
         let config = &unit.config;
-        let steps = motion::steps(unit.world_start, waiting.capture, config.pose_rate_hz);
-        let pose = motion::to_and_fro(steps, config.rendered_poses());
+        let pose = config.pose_at(unit.world_start, waiting.capture);
         let counted = match &mut stream.source {
             Source::Motion(filler) => filler.count(waiting.k, &waiting.boot),
             _ => waiting.k,

@@ -1,8 +1,10 @@
 //! The configuration of a simulated camera, as plain values that a rig file maps onto.
 
+use super::arm::{self, Arm};
 use super::board::BoardScene;
+use super::motion;
 use core::ops::RangeInclusive;
-use depthrig_bus::{Pose, StreamName};
+use depthrig_bus::{HostTime, Pose, StreamName};
 use depthrig_calib::PoseExt;
 use depthrig_driver::{Error, ErrorKind, Result};
 use serde::{Deserialize, Serialize};
@@ -51,6 +53,8 @@ pub struct SyntheticConfig {
     pub ring_frames: u32,
     /// A printed board in front of the mount, which then stands still.
     pub board: Option<BoardScene>,
+    /// A robot's arm on the table that moves, [`super::arm`]; the mount then stands still.
+    pub arm: bool,
 }
 
 impl Default for SyntheticConfig {
@@ -73,6 +77,7 @@ impl Default for SyntheticConfig {
             gain: *GAINS.start(),
             ring_frames: 8,
             board: None,
+            arm: false,
         }
     }
 }
@@ -231,9 +236,21 @@ impl SyntheticConfig {
         self.board.as_ref().map_or(self.pose_on_mount, |b| self.pose_on_mount.compose(&b.displaced))
     }
 
-    /// Poses of the mount that are rendered: beside a board it stands still.
+    /// Poses of the mount, or of the arm, that are rendered: beside a board nothing but the board moves.
     pub(crate) const fn rendered_poses(&self) -> u32 {
-        if self.board.is_some() { 1 } else { self.poses }
+        match self {
+            Self { board: Some(_), .. } => 1,
+            Self { arm: true, .. } => arm::POSES,
+            _ => self.poses,
+        }
+    }
+
+    /// The pose that is shown at `t`.
+    pub(crate) fn pose_at(&self, world_start: HostTime, t: HostTime) -> u32 {
+        if self.arm && self.board.is_none() {
+            return Arm::pose_at(t);
+        }
+        motion::to_and_fro(motion::steps(world_start, t, self.pose_rate_hz), self.rendered_poses())
     }
 
     /// How messages name the camera.

@@ -1,5 +1,6 @@
 //! Rendering a camera's loop of images once, and finding it again in the cache.
 
+use super::arm::Arm;
 use super::cache::{ImageFile, Wanted};
 use super::config::SyntheticConfig;
 use super::models::Model;
@@ -164,13 +165,12 @@ impl Scene {
         }
         let Self { profile, config, .. } = self;
         let rays = Rays::new(&profile.intrinsics, profile.width, profile.height);
-        let world = World::new();
         progress(0, self.poses());
         ImageFile::create(&self.path, &self.wanted(), |pose| {
             if !go_on() {
                 return Err(Error::new(ErrorKind::Io, "rendering was stopped"));
             }
-            let made = self.render(&world, &rays, pose);
+            let made = self.render(&rays, pose);
             progress(pose as usize + 1, config.rendered_poses() as usize);
             Ok(made)
         })
@@ -186,16 +186,19 @@ impl Scene {
         // Pixel centres are at whole numbers.
         (k.cx, k.cy) = ((k.cx + 0.5) * scale - 0.5, (k.cy + 0.5) * scale - 0.5);
         let rays = Rays::new(&k, small(p.width), small(p.height));
-        let planes = self.render(&World::new(), &rays, 0);
+        let planes = self.render(&rays, 0);
         let pixel = p.frame_bytes() / (p.width as usize * p.height as usize);
         planes.iter().map(|plane| enlarge(plane, pixel, p.width as usize, p.height as usize)).collect()
     }
 
     /// Every plane at `pose`.
-    fn render(&self, world: &World, rays: &Rays, pose: u32) -> Vec<Vec<u8>> {
+    fn render(&self, rays: &Rays, pose: u32) -> Vec<Vec<u8>> {
         let Self { config, model, .. } = self;
+        let world = &World::fixed(config.arm.then(|| Arm::in_pose(pose)));
         let camera = config.true_pose().compose(&self.profile.pose_in_device).to_affine();
-        let view = View::new(rays, &(motion::mount(pose, config.rendered_poses()) * camera));
+        let mount =
+            if config.arm { motion::mount(0, 1) } else { motion::mount(pose, config.rendered_poses()) };
+        let view = View::new(rays, &(mount * camera));
         let seed = mix(text_seed(config.seed, &config.serial_or_default()).wrapping_add(u64::from(pose)));
         let bytes = |counts: Vec<u16>| counts.iter().flat_map(|z| z.to_le_bytes()).collect();
         match self.content {
@@ -226,8 +229,9 @@ fn enlarge(small: &[u8], bytes: usize, width: usize, height: usize) -> Vec<u8> {
 /// Everything that the images depend on, as text.
 fn key(config: &SyntheticConfig, model: &Model, p: &StreamProfile, planes: u32) -> String {
     let stream = file_of(p);
+    let arm = if config.arm { "arm 1 " } else { "" };
     format!(
-        "render {RENDER_VERSION} {stream} planes {planes} poses {} seed {} serial {} model {} {:?} unit {} range {:?} \
+        "render {RENDER_VERSION} {arm}{stream} planes {planes} poses {} seed {} serial {} model {} {:?} unit {} range {:?} \
          white {:?} size {}x{} {:?} on mount {:?} in device {:?}",
         config.rendered_poses(),
         config.seed,

@@ -1,6 +1,7 @@
 //! The world that a camera sees, and the fixed one that all simulated cameras share: a room with a table and the things that give depth cameras
 //! trouble: thin, transparent, mirroring, dark, shiny and plain ones.
 
+use super::arm::Arm;
 use super::shape::{Shape, Solid};
 use super::texture::{Look, Paint, Surface};
 use glam::{Mat3, Quat, Vec3};
@@ -45,6 +46,13 @@ impl Thing {
         };
         Self { solid, paint, is_thin }
     }
+
+    /// A capsule from `a` to `b`.
+    pub(crate) fn rod(a: Vec3, b: Vec3, radius: f32, paint: Paint) -> Self {
+        let turn = Mat3::from_quat(Quat::from_rotation_arc(Vec3::Z, (b - a).normalize_or(Vec3::Z)));
+        let shape = Shape::Capsule { half: (b - a).length() / 2.0, radius };
+        Self::new(Solid::new(shape, (a + b) / 2.0, turn), paint)
+    }
 }
 
 /// Where a ray ends: the distance, and what is there (solid number and face).
@@ -84,12 +92,13 @@ pub(crate) struct World {
 }
 
 impl World {
-    /// Builds the fixed scene of the simulated cameras; it is always the same one.
-    pub(crate) fn new() -> Self {
+    /// Builds the fixed scene of the simulated cameras, which is always the same one, with an arm on the table if there is one.
+    pub(crate) fn fixed(arm: Option<Arm>) -> Self {
         let mut b = Builder { things: Vec::new() };
         b.furniture();
         b.table_setting();
         b.fork();
+        b.things.extend(arm.iter().flat_map(Arm::things));
         Self {
             things: b.things,
             lamps: vec![LAMP],
@@ -258,8 +267,7 @@ impl Builder {
     }
 
     fn rod(&mut self, a: Vec3, b: Vec3, radius: f32, paint: Paint) {
-        let turn = Mat3::from_quat(Quat::from_rotation_arc(Vec3::Z, (b - a).normalize_or(Vec3::Z)));
-        self.add(Shape::Capsule { half: (b - a).length() / 2.0, radius }, (a + b) / 2.0, turn, paint);
+        self.things.push(Thing::rod(a, b, radius, paint));
     }
 
     fn furniture(&mut self) {
@@ -344,7 +352,7 @@ mod tests {
 
     #[test]
     fn every_ray_ends_somewhere_in_the_room() {
-        let world = World::new();
+        let world = World::fixed(None);
         let all = world.all();
         let from = Vec3::new(0.0, -0.6, 0.5);
         for i in 0..5000u32 {
@@ -364,7 +372,7 @@ mod tests {
 
     #[test]
     fn nothing_but_glass_lets_light_through() {
-        let world = World::new();
+        let world = World::fixed(None);
         let all = world.all();
         let from = Vec3::new(0.19, -0.3, 0.1);
         let wall =
