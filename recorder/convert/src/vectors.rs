@@ -23,7 +23,7 @@ pub enum Gaps {
 /// The signals of an export.
 #[derive(Debug, Clone, Serialize)]
 pub struct VectorOptions {
-    /// Signals of the state, in this order. None means all that are no actions.
+    /// Signals of the state, in this order. None means all that are no actions, by name.
     pub state: Vec<StreamId>,
     /// Signals of the action. None means all whose device or signal is named `action` or begins with `action_`.
     pub action: Vec<StreamId>,
@@ -75,7 +75,12 @@ impl Vector {
         let named =
             |ids: &[StreamId]| ids.iter().map(|id| find(first, id).cloned()).collect::<Result<Vec<_>>>();
         let of = |ids: &[StreamId], action: bool| match ids {
-            [] => Ok(all.iter().filter(|s| is_action(&s.id) == action).cloned().collect()),
+            [] => {
+                // By name: the session has them in the order in which they appeared.
+                let mut found: Vec<_> = all.iter().filter(|s| is_action(&s.id) == action).cloned().collect();
+                found.sort_by(|a, b| a.id.cmp(&b.id));
+                Ok(found)
+            }
             ids => named(ids),
         };
         let chosen = [of(&options.state, false)?, of(&options.action, true)?];

@@ -1,0 +1,230 @@
+"""Demonstrations from end to end: simulated cameras see an arm, whose process publishes its joints; episodes are recorded, one is
+discarded, the daemon is killed in one; what was recovered becomes a dataset that LeRobot trains on.
+
+The values that must be in the export are NumPy's interpolation of the samples as Python's mcap reads them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import depthrig
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from test_daemon import ROOT, WAIT_S, binary, command, environment, running, runtime
+
+__all__ = ["binary", "runtime"]
+
+LOADER = ROOT / ".venv-lerobot" / "bin" / "python"
+JOINTS = ["base", "shoulder", "elbow", "wrist"]
+RIG = """
+rig = "cell"
+[sets]
+rate_hz = 5.0
+[recording]
+reserve_mb = 16
+[[camera]]
+name = "top"
+backend = "synthetic"
+model = "d435"
+arm = true
+cache_dir = "cache"
+[[camera.stream]]
+name = "color"
+width = 640
+height = 480
+rate_hz = 15.0
+[[camera.stream]]
+name = "depth"
+width = 640
+height = 480
+rate_hz = 15.0
+"""
+
+
+@contextmanager
+def arm(binary: str, runtime: Path) -> Iterator[subprocess.Popen[bytes]]:  # noqa: F811
+    """The robot's process."""
+    program = Path(binary).parent / "examples" / "arm"
+    if not program.exists():
+        subprocess.run(["cargo", "build", "-p", "depthrig-tests", "--example", "arm"], cwd=ROOT, check=True)
+    with subprocess.Popen([program, runtime]) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def wait_for_sets(recording: depthrig.Recording, more: int) -> None:
+    def sets() -> int:
+        return int((recording.status() or {}).get("sets", 0))
+
+    until = sets() + more
+    deadline = time.monotonic() + WAIT_S
+    while sets() < until:
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def wait_until_rendered(binary: str, runtime: Path) -> None:  # noqa: F811
+    """Until the images are no longer sketches."""
+    deadline = time.monotonic() + WAIT_S
+    while True:
+        asked = [binary, "status", "--json"]
+        done = subprocess.run(asked, env=environment(runtime), capture_output=True, text=True, timeout=WAIT_S, check=False)
+        if done.returncode == 0:
+            cameras = json.loads(done.stdout)
+            if not cameras.get("preparing") and all(c["state"] == "streaming" for c in cameras["cameras"]):
+                return
+        assert time.monotonic() < deadline, done.stdout + done.stderr
+        time.sleep(0.2)
+
+
+def samples(dataset: Path, topic: str, values: str) -> tuple[np.ndarray, np.ndarray]:
+    """UTC times, nanoseconds, and values of a signal, by Python's mcap."""
+    times, rows = [], []
+    for segment in sorted(dataset.glob("seg_*.mcap")):
+        with segment.open("rb") as file:
+            reader = make_reader(file, decoder_factories=[DecoderFactory()])
+            for _, _, message, decoded in reader.iter_decoded_messages(topics=[topic]):
+                times.append(message.publish_time)
+                rows.append(
+                    list(decoded.position) if values == "position" else [f.floats[0] for f in decoded.fields]
+                )
+    return np.array(times), np.array(rows)
+
+
+def exported_rows(out: Path) -> list[dict]:
+    return [r for f in sorted(out.rglob("data/**/*.parquet")) for r in pq.read_table(f).to_pylist()]
+
+
+@pytest.fixture(scope="module")
+def recovered(binary: str, runtime: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: F811
+    """Five episodes, of which the third is discarded and the fifth is running when the daemon is killed."""
+    folder = tmp_path_factory.mktemp("demonstrations")
+    rig = folder / "rig.toml"
+    rig.write_text(RIG)
+    with arm(binary, runtime), running(binary, runtime, folder / "log", "run", str(rig), codes=(-signal.SIGKILL,)) as daemon:
+        wait_until_rendered(binary, runtime)
+        with depthrig.SignalReader("arm/action", runtime_dir=runtime) as reader:
+            reader.wait(timeout=WAIT_S)
+        recording = depthrig.Recording("cell", runtime)
+        dataset = Path(recording.start(scene="table")["path"])
+        for number in range(1, 5):
+            with recording.episode(f"task {number % 2}"):
+                wait_for_sets(recording, 6)
+            recording.mark_episode("failure" if number == 2 else "success")
+            if number == 3:
+                recording.discard_episode()
+        recording.start_episode("killed in it")
+        # Sets are on the disk a second after they were recorded.
+        wait_for_sets(recording, 12)
+        daemon.kill()
+        daemon.wait(WAIT_S)
+    command(binary, runtime, "recover", str(dataset), codes=(0, 3))
+    command(binary, runtime, "verify", "--decode", str(dataset), codes=(0, 3))
+    return dataset
+
+
+def test_the_export_has_the_arm_as_it_was_at_each_set(
+    binary: str,  # noqa: F811
+    runtime: Path,  # noqa: F811
+    recovered: Path,
+    tmp_path: Path,
+) -> None:
+    out = tmp_path / "lerobot"
+    said = command(binary, runtime, "export", "lerobot", str(recovered), str(out), codes=(0, 3))
+    assert "episode 3 (discarded), episode 5 (running or cut off)" in said
+    rows = exported_rows(out)
+    assert {r["episode_index"] for r in rows} == {0, 1, 2}
+    info = json.loads((out / "meta" / "info.json").read_text())
+    state = info["features"]["observation.state"]
+    assert state["names"] == ["arm/gripper.opening", *(f"arm/joint_position.{j}" for j in JOINTS)]
+    assert "at most 0.2 s apart" in state["info"]["depthrig.interpolation"]
+
+    times = np.array([r["capture.utc_ns"] for r in rows])
+    for column, parts in {
+        "observation.state": [("gripper/values", "fields"), ("joint_position/joint_states", "position")],
+        "action": [("action/values", "fields")],
+    }.items():
+        got = np.array([r[column] for r in rows], dtype=np.float32)
+        expected = []
+        for topic, kind in parts:
+            at, values = samples(recovered, f"/cell/arm/{topic}", kind)
+            assert at[0] <= times[0] and times[-1] <= at[-1]
+            begin = at[0]
+            expected += [np.interp(times - begin, at - begin, values[:, i]) for i in range(values.shape[1])]
+        np.testing.assert_allclose(got, np.stack(expected, axis=1), rtol=3e-7, atol=1e-7)
+
+    # The task was done at the end of the first and of the fourth episode.
+    ends = [max(i for i, r in enumerate(rows) if r["episode_index"] == e) for e in (0, 1, 2)]
+    assert [i for i, r in enumerate(rows) if r["next.success"]] == [ends[0], ends[2]]
+    stats = json.loads((out / "meta" / "stats.json").read_text())
+    all_states = np.array([r["observation.state"] for r in rows])
+    for name, value in [("min", all_states.min(0)), ("max", all_states.max(0)), ("mean", all_states.mean(0))]:
+        np.testing.assert_allclose(stats["observation.state"][name], value, rtol=1e-5, atol=1e-6)
+
+
+def test_lerobot_trains_on_it(binary: str, runtime: Path, recovered: Path, tmp_path: Path) -> None:  # noqa: F811
+    if not LOADER.exists():
+        pytest.skip("the package lerobot is not installed (make test does it)")
+    out = tmp_path / "lerobot"
+    command(binary, runtime, "edit", str(recovered), "--episode", "5=success", codes=(0, 3))
+    command(binary, runtime, "export", "lerobot", str(recovered), str(out), codes=(0, 3))
+    script = Path(__file__).with_name("lerobot_train.py")
+    call = [LOADER, script, out, "observation.images.top_color", "20"]
+    offline = {**os.environ, "HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "hf")}
+    done = subprocess.run(call, env=offline, capture_output=True, text=True, timeout=10 * WAIT_S, check=False)
+    assert done.returncode == 0, done.stderr
+    said = json.loads(done.stdout.splitlines()[-1])
+    assert said["episodes"] == 4
+    assert said["tasks"] == ["task 1", "task 0", "killed in it"]
+    assert said["action"] == [5]
+    assert said["success"] == 3
+    losses = said["losses"]
+    assert len(losses) == 20 and np.isfinite(losses).all()
+    assert np.mean(losses[-5:]) < np.mean(losses[:5])
+
+
+def test_a_gap_is_named_and_refused_or_masked(binary: str, runtime: Path, tmp_path: Path) -> None:  # noqa: F811
+    rig = tmp_path / "rig.toml"
+    rig.write_text(RIG.replace("[[camera.stream]]", "cheap = true\n[[camera.stream]]", 1))
+    with running(binary, runtime, tmp_path / "log", "run", str(rig), codes=(0, 3)):
+        wait_until_rendered(binary, runtime)
+        recording = depthrig.Recording("cell", runtime)
+        with arm(binary, runtime):
+            with depthrig.SignalReader("arm/action", runtime_dir=runtime, timeout=WAIT_S) as reader:
+                reader.wait(timeout=WAIT_S)
+            dataset = Path(recording.start()["path"])
+            wait_for_sets(recording, 4)
+        wait_for_sets(recording, 4)
+        with arm(binary, runtime):
+            wait_for_sets(recording, 8)
+            recording.stop()
+    out = tmp_path / "out"
+    call = [binary, "export", "lerobot", str(dataset), str(out)]
+    refused = subprocess.run(call, capture_output=True, text=True, timeout=WAIT_S, check=False)
+    assert refused.returncode == 2
+    assert "signal arm/gripper has no samples at most 0.2 s apart" in refused.stderr
+    assert "--gaps mask" in refused.stderr
+    assert not out.exists()
+    command(binary, runtime, *call[1:], "--gaps", "mask", codes=(0, 3))
+    rows = exported_rows(out)
+    missing = [r["missing.observation.state"] for r in rows]
+    assert any(missing) and not missing[0] and not missing[-1]
+    # The state that is held is the last one before the gap.
+    first = missing.index(True)
+    held = {tuple(r["observation.state"]) for r in rows[first : first + 2] if r["missing.observation.state"]}
+    at, values = samples(dataset, "/cell/arm/joint_position/joint_states", "position")
+    before = at <= rows[first]["capture.utc_ns"]
+    np.testing.assert_allclose(next(iter(held))[1:], values[before][-1], rtol=3e-7)
