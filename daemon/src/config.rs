@@ -25,7 +25,7 @@ pub use error::{ConfigError, Problem};
 pub use stereo::StereoConfig;
 
 use crate::family::{FAMILIES, Family};
-use depthrig_bus::{CameraName, Pose, RigName, StreamName};
+use depthrig_bus::{CameraName, Pose, RigName, SignalName, StreamName};
 use depthrig_calibrate::file::{CalibratedCamera, Calibration, DepthCorrection, lens_position};
 use depthrig_driver::{StreamProfile, StreamRequest};
 use depthrig_stereo::StereoOptions;
@@ -66,10 +66,23 @@ pub struct RigConfig {
     pub calibration_text: String,
     /// The cameras in the order of the file; at least one, names unique.
     pub cameras: Vec<CameraConfig>,
+    /// Signals that the file names; others are recorded as well.
+    pub signals: Vec<SignalConfig>,
     /// The file's text.
     pub text: String,
     /// The file, if it came from one; absolute.
     pub path: Option<PathBuf>,
+}
+
+/// A signal that the rig needs.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SignalConfig {
+    /// Its name, `DEVICE/SIGNAL`.
+    pub name: SignalName,
+    /// No recording begins while it is silent.
+    pub required: bool,
+    /// It is silent when no sample came for so long, seconds.
+    pub silent_s: f64,
 }
 
 /// Shared memory.

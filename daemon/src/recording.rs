@@ -1,9 +1,9 @@
 //! Recording under control of the daemon: start, stop, notes, and the numbers that go with it.
 
-use crate::config::{RecordingConfig, RigConfig};
+use crate::config::{RecordingConfig, RigConfig, SignalConfig};
 use crate::control::{EpisodeRequest, LiveRig, RecordRequest};
 use crate::losses::{LossHistory, Losses, RecordingLosses};
-use crate::status::{RecordingStatus, SetAccount};
+use crate::status::{RecordingStatus, SetAccount, SignalStatus};
 use crate::stream::Stream;
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
@@ -264,6 +264,11 @@ impl Recording {
     /// Forgets the signals that nobody publishes any more: a recording that begins does not list them.
     pub fn keep_signals(&mut self, is_published: impl Fn(&StreamId) -> bool) {
         self.signals.keep(is_published);
+    }
+
+    /// The signals at `now`: those that `named` lists in its order, then others.
+    pub fn signal_states(&self, named: &[SignalConfig], now: HostTime) -> Vec<SignalStatus> {
+        self.signals.states(named, now)
     }
 
     /// The signals that are published, for a recording that begins.

@@ -334,6 +334,7 @@ fn recording_config(sources: &mut Sources) -> RigConfig {
         cdm: CdmConfig::default(),
         calibration: None,
         calibration_text: sources.session().calibration.clone(),
+        signals: Vec::new(),
         cameras: Vec::new(),
         text: sources.session().rig_config.clone(),
         path: None,

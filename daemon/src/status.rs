@@ -21,6 +21,9 @@ pub struct RigStatus {
     pub preparing: Option<PreparingStatus>,
     /// Cameras in the order of the configuration.
     pub cameras: Vec<CameraStatus>,
+    /// Signals that are published, and those that the rig file names.
+    #[serde(default)]
+    pub signals: Vec<SignalStatus>,
     /// The set assembler.
     pub sets: SetStatus,
     /// The recording in progress, or the last one.
@@ -31,6 +34,35 @@ pub struct RigStatus {
     pub cpu_cores: f64,
     /// The replay, when the cameras are those of a dataset.
     pub replay: Option<ReplayStatus>,
+}
+
+/// A signal.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SignalStatus {
+    /// Its name, `DEVICE/SIGNAL`.
+    pub signal: String,
+    /// Whether the rig file requires it.
+    pub required: bool,
+    /// Whether samples come.
+    pub state: SignalState,
+    /// How long ago the last sample came, seconds; `None` before the first.
+    pub age_s: Option<f64>,
+    /// Samples that came since the rig started, or since it was published anew.
+    pub samples: u64,
+    /// Samples that were replaced on the channel before they were read.
+    pub missed: u64,
+}
+
+/// Whether samples of a signal come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SignalState {
+    /// They do.
+    Live,
+    /// Its publisher is there and silent for longer than the rig file allows.
+    Silent,
+    /// Nobody publishes it.
+    Missing,
 }
 
 /// How far the scenes of simulated cameras are rendered.

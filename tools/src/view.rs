@@ -6,7 +6,7 @@ use core::fmt::Write as _;
 use depthrig_bus::DropReason;
 use depthrig_daemon::status::{
     CameraState, CameraStatus, PreparingStatus, RecordingStatus, RefineState, ReplayStatus, RigStatus,
-    StreamStatus,
+    SignalState, SignalStatus, StreamStatus,
 };
 use depthrig_recorder::report::page;
 use std::collections::BTreeMap;
@@ -73,6 +73,7 @@ pub fn status(rig: &RigStatus, style: Style) -> String {
     ));
     lines.push(String::new());
     lines.extend(streams(rig, style));
+    lines.extend(signals(rig, style));
     lines.extend(poor_metadata(rig));
     lines.extend(rig.cameras.iter().filter_map(|c| refined(c, style)));
     lines.extend(calibrated(rig, style));
@@ -82,6 +83,23 @@ pub fn status(rig: &RigStatus, style: Style) -> String {
         lines.extend(troubles);
     }
     lines.join("\n")
+}
+
+/// A line for each signal.
+fn signals(rig: &RigStatus, style: Style) -> Vec<String> {
+    let line = |s: &SignalStatus| {
+        let required = if s.required { ", required" } else { "" };
+        let age = s.age_s.map_or_else(String::new, |age| format!(", the last {age:.1} s ago"));
+        let came = format!("{}{age}, missed {}", out::count(s.samples, "sample"), s.missed);
+        let bad = |text: &str| if s.required { style.paint(RED, text) } else { style.paint(YELLOW, text) };
+        let state = match s.state {
+            SignalState::Live => came,
+            SignalState::Silent => format!("{}: {came}", bad("silent")),
+            SignalState::Missing => bad("nobody publishes it"),
+        };
+        format!("signal  {}{required}: {state}", s.signal)
+    };
+    rig.signals.iter().map(line).collect()
 }
 
 /// Says how old the cameras' calibrations are and what they are worth, or that several cameras have none.

@@ -127,6 +127,7 @@ pub(crate) fn rig_with(port: &str) -> RigStatus {
         shared_memory: crate::status::SharedMemoryStatus::default(),
         cpu_cores: 0.0,
         replay: None,
+        signals: Vec::new(),
     }
 }
 

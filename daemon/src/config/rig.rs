@@ -4,10 +4,10 @@ use super::read::{FromToml, Report, Section};
 use super::value::{above_zero, not_empty, rate, resolve, within};
 use super::{
     BusConfig, ColorCodec, ConfigError, ControlConfig, DepthCodec, MAX_CAMERAS, Phase, Port, RecordingConfig,
-    RigConfig, SetsConfig, SupervisorConfig, camera, refine,
+    RigConfig, SetsConfig, SignalConfig, SupervisorConfig, camera, refine,
 };
 use crate::family::Family;
-use depthrig_bus::RigName;
+use depthrig_bus::{RigName, SignalName};
 use std::path::{Path, PathBuf};
 use toml::de::DeTable;
 
@@ -54,6 +54,7 @@ pub(super) fn read(
     let supervisor = supervisor(&top);
     let cdm = refine::cdm(&top, &base);
     let cameras = cameras(&top, &base, families);
+    let signals = signals(&top);
     check_set_rate(&top, &sets, &cameras);
     top.finish();
     let text = text.to_owned();
@@ -74,6 +75,7 @@ pub(super) fn read(
         calibration,
         calibration_text: String::new(),
         cameras,
+        signals,
         text,
         path,
     })
@@ -170,6 +172,26 @@ fn cameras(top: &Section<'_, '_>, base: &Path, families: &[Family]) -> Vec<Optio
     }
     let mut names = Vec::new();
     sections.into_iter().map(|s| camera::read(s, base, families, &mut names)).collect()
+}
+
+fn signals(top: &Section<'_, '_>) -> Vec<SignalConfig> {
+    let mut signals: Vec<SignalConfig> = Vec::new();
+    for s in top.tables("signal", "[[signal]]").into_iter().flatten() {
+        let name = s.required::<String>("name", "\"arm/joint_position\"");
+        let required = s.or("required", false, |_| Ok(()));
+        let silent_s = s.or("silent_s", 1.0, above_zero(3600.0));
+        if let Some(found) = name {
+            match found.value.parse::<SignalName>() {
+                Err(e) => s.problem(found.at, e.to_string()),
+                Ok(name) if signals.iter().any(|other| other.name == name) => {
+                    s.problem(found.at, format!("signal {name} is named twice; remove one of its tables"));
+                }
+                Ok(name) => signals.push(SignalConfig { name, required, silent_s }),
+            }
+        }
+        s.finish();
+    }
+    signals
 }
 
 /// Sets faster than every camera would all be incomplete. Only rates that the file itself gives are known here.

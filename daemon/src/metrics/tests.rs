@@ -123,6 +123,7 @@ fn rig() -> RigStatus {
         shared_memory: SharedMemoryStatus { free_bytes: 8 << 30, slots: 48, reserved_bytes: 3 << 30 },
         cpu_cores: 0.75,
         replay: None,
+        signals: Vec::new(),
     }
 }
 

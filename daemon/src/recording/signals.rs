@@ -5,6 +5,8 @@
 //! with other fields is not, until the next recording: the fields of a channel stay the same over a dataset.
 
 use super::waiting::Waiting;
+use crate::config::SignalConfig;
+use crate::status::{SignalState, SignalStatus};
 use depthrig_bus::{DropCounts, DropReason, HostTime, SignalSample, StreamId};
 use depthrig_recorder::{RecordSignal, Recorder, SET_SIGNALS_MAX_BYTES, SignalRecord, StreamAccount};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
@@ -21,6 +23,10 @@ pub(super) struct Known(BTreeMap<StreamId, Published>);
 
 struct Published {
     record: SignalRecord,
+    /// When the last sample was read.
+    heard: HostTime,
+    samples: u64,
+    missed: u64,
     /// The last samples while nothing is recorded.
     before: VecDeque<SignalSample>,
 }
@@ -40,12 +46,26 @@ impl Known {
             let is_known = self.0.get(id).is_some_and(|p| Arc::ptr_eq(&p.record.description, description));
             if !is_known {
                 let record = SignalRecord::new(description);
-                self.0.insert(id.clone(), Published { record, before: VecDeque::new() });
+                let fresh = Published {
+                    record,
+                    heard: HostTime::now(),
+                    samples: 0,
+                    missed: 0,
+                    before: VecDeque::new(),
+                };
+                self.0.insert(id.clone(), fresh);
+            }
+        }
+        if let Some(published) = self.0.get_mut(id) {
+            published.missed += missed;
+            published.samples += samples.len() as u64;
+            if !samples.is_empty() {
+                published.heard = HostTime::now();
             }
         }
         if let Some((signals, recorder)) = recording {
             signals.hear(recorder, id, samples, missed);
-        } else if let Some(Published { record, before }) = self.0.get_mut(id) {
+        } else if let Some(Published { record, before, .. }) = self.0.get_mut(id) {
             before.extend(samples.into_iter().filter(|s| *s.description() == record.description));
             before.drain(..before.len().saturating_sub(BEFORE_SAMPLES));
         }
@@ -65,6 +85,32 @@ impl Known {
     /// Forgets the signals that nobody publishes any more.
     pub(super) fn keep(&mut self, is_published: impl Fn(&StreamId) -> bool) {
         self.0.retain(|id, _| is_published(id));
+    }
+
+    /// Their states at `now`: those that `named` lists in its order, then others.
+    pub(super) fn states(&self, named: &[SignalConfig], now: HostTime) -> Vec<SignalStatus> {
+        let id_of =
+            |c: &SignalConfig| StreamId { camera: c.name.device().clone(), stream: c.name.signal().clone() };
+        let state = |id: &StreamId, config: Option<&SignalConfig>| {
+            let found = self.0.get(id);
+            let age_s = found.map(|p| now.since_ns(p.heard).max(0) as f64 / 1e9);
+            let silent_s = config.map_or(f64::INFINITY, |c| c.silent_s);
+            SignalStatus {
+                signal: id.to_string(),
+                required: config.is_some_and(|c| c.required),
+                state: match age_s {
+                    None => SignalState::Missing,
+                    Some(age) if age > silent_s => SignalState::Silent,
+                    Some(_) => SignalState::Live,
+                },
+                age_s,
+                samples: found.map_or(0, |p| p.samples),
+                missed: found.map_or(0, |p| p.missed),
+            }
+        };
+        let configured: Vec<_> = named.iter().map(id_of).collect();
+        let others = self.0.keys().filter(|id| !configured.contains(id)).map(|id| state(id, None));
+        configured.iter().zip(named).map(|(id, c)| state(id, Some(c))).chain(others).collect()
     }
 
     /// All of them.

@@ -217,6 +217,7 @@ impl Control for Inner {
                     .sum(),
             },
             cpu_cores: self.cpu_millicores.load(Ordering::Relaxed) as f64 / 1000.0,
+            signals: Vec::new(),
             replay: Some(self.replay_status()),
         }
     }

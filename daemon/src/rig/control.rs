@@ -75,6 +75,7 @@ impl Control for Inner {
         let _one_at_a_time = lock(&self.starting);
         self.recording().must_be_idle()?;
         self.must_be_drawn()?;
+        self.signals_must_come()?;
         let sets_hz = self.config.sets.rate_hz;
         // Without the recording's lock: making a file must not keep the set thread waiting.
         let signals = self.recording().signals();

@@ -30,6 +30,7 @@ pub fn status(inner: &Inner) -> RigStatus {
         utc_ns: UtcPair::sample().utc_ns(now),
         preparing: inner.drawing().map(preparing),
         cameras,
+        signals: inner.recording().signal_states(&inner.config.signals, now),
         sets: sets(inner),
         recording: recording(inner),
         shared_memory: SharedMemoryStatus {

@@ -3,9 +3,10 @@
 //! It is a reader like any other and has a thread of its own: a channel that is slow to open holds up no frame set.
 
 use super::Inner;
+use crate::status::{SignalState, SignalStatus};
 use core::time::Duration;
 use depthrig_bus::{ErrorKind, HostTime, SignalName, SignalSubscriber, Signals, StreamId};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -16,6 +17,39 @@ const LOOK_EVERY_NS: i64 = 200_000_000;
 /// Samples of a signal that are handed over together.
 const BATCH: usize = 512;
 
+impl Inner {
+    /// Refuses a recording while a signal that the rig requires does not come.
+    ///
+    /// # Errors
+    /// [`crate::ErrorKind::WrongState`] naming the signals.
+    pub(super) fn signals_must_come(&self) -> crate::Result<()> {
+        let states = self.recording().signal_states(&self.config.signals, HostTime::now());
+        let silent: Vec<_> = states.iter().filter_map(trouble).collect();
+        if silent.is_empty() {
+            return Ok(());
+        }
+        let silent = silent.join("; ");
+        Err(crate::Error::new(
+            crate::ErrorKind::WrongState,
+            format!("{silent}; start the robot's process, or remove required = true from the rig file"),
+        ))
+    }
+}
+
+/// What is wrong with a signal that the rig requires, in words.
+fn trouble(signal: &SignalStatus) -> Option<String> {
+    let name = &signal.signal;
+    match signal.state {
+        _ if !signal.required => None,
+        SignalState::Live => None,
+        SignalState::Missing => Some(format!("nobody publishes signal {name}, which this rig requires")),
+        SignalState::Silent => {
+            let age_s = signal.age_s.unwrap_or_default();
+            Some(format!("signal {name}, which this rig requires, has been silent for {age_s:.1} s"))
+        }
+    }
+}
+
 /// The thread's state.
 pub struct Collector {
     inner: Arc<Inner>,
@@ -23,6 +57,8 @@ pub struct Collector {
     inputs: BTreeMap<SignalName, Input>,
     /// Signals that cannot be read, so that it is said once.
     unread: BTreeMap<SignalName, ErrorKind>,
+    /// Required signals that do not come, so that it is said once.
+    troubles: BTreeSet<String>,
 }
 
 /// One signal.
@@ -42,7 +78,13 @@ impl Collector {
     /// As [`Signals::open`].
     pub fn new(inner: Arc<Inner>) -> crate::Result<Self> {
         let signals = Signals::open(&inner.runtime)?;
-        Ok(Self { inner, signals, inputs: BTreeMap::new(), unread: BTreeMap::new() })
+        Ok(Self {
+            inner,
+            signals,
+            inputs: BTreeMap::new(),
+            unread: BTreeMap::new(),
+            troubles: BTreeSet::new(),
+        })
     }
 
     /// Runs until the rig stops.
@@ -87,6 +129,29 @@ impl Collector {
             published.iter().any(|(name, _)| (name.device(), name.signal()) == (&id.camera, &id.stream))
         };
         self.inner.recording().keep_signals(is_published);
+        self.watch();
+    }
+
+    /// Logs required signals that fall silent, and those that come again.
+    fn watch(&mut self) {
+        if self.inner.config.signals.is_empty() {
+            return;
+        }
+        let states = self.inner.recording().signal_states(&self.inner.config.signals, HostTime::now());
+        for signal in &states {
+            match trouble(signal) {
+                Some(why) => {
+                    if self.troubles.insert(signal.signal.clone()) {
+                        tracing::error!("{why}");
+                    }
+                }
+                None => {
+                    if self.troubles.remove(&signal.signal) {
+                        tracing::info!("signal {} comes again", signal.signal);
+                    }
+                }
+            }
+        }
     }
 }
 

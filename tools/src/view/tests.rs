@@ -67,6 +67,7 @@ fn rig() -> RigStatus {
         shared_memory: SharedMemoryStatus { free_bytes: 1 << 30, slots: 48, reserved_bytes: 1 << 29 },
         cpu_cores: 0.5,
         replay: None,
+        signals: Vec::new(),
     }
 }
 
