@@ -101,7 +101,7 @@ def millimetres() -> None:
     class Of:
         def __init__(self, metres: list[float], unit: float) -> None:
             self.metres = np.array([metres], np.float32)
-            self.header = type("Header", (), {"pixel_format": depthrig.PixelFormat.DEPTH_F32, "depth_unit_m": unit})
+            self.header = type("Header", (), {"format": int(depthrig.PixelFormat.DEPTH_F32), "depth_unit_m": unit})
 
         def depth_m(self) -> np.ndarray:
             return self.metres

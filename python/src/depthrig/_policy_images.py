@@ -18,7 +18,7 @@ from ._frame import Frame
 from ._group import FrameGroup, SetReader
 from ._reader import LIVENESS_S, SLICE_S
 from ._sets import FrameSet, Sets
-from .errors import StreamGone
+from .errors import StreamGone, StreamNotFound
 
 # Records that have come before a set is observed. A subscriber that holds more than three frames stops the player.
 _AHEAD = 2
@@ -101,7 +101,7 @@ class ReplayedImages:
             del frame  # gives its slot back before the next one is taken
 
 
-def open_images(reader: SetReader, sets: Sets, timeout: float) -> ReplayedImages | SetReader | None:
+def open_images(reader: SetReader, sets: Sets | None, timeout: float) -> ReplayedImages | SetReader | None:
     """Wait up to `timeout` seconds for an image and return the reader for its kind of rig; None when none came."""
     deadline = time.monotonic() + timeout
     while True:
@@ -109,8 +109,11 @@ def open_images(reader: SetReader, sets: Sets, timeout: float) -> ReplayedImages
             frame = stream._take()
             if frame is not None:
                 if frame.replayed:
+                    if sets is None:
+                        raise StreamNotFound(f"rig {reader.rig!r} is a replay without frame sets, which cannot be followed")
                     return ReplayedImages(reader, sets, {name: frame})
-                sets.close()
+                if sets is not None:
+                    sets.close()
                 return reader
         now = time.monotonic()
         if now >= deadline:

@@ -28,7 +28,7 @@ from ._sets import Sets
 from ._signal import Signal
 from ._signal_reader import SignalReader
 from ._signal_sample import SignalSample
-from .errors import SignalGap, SignalOutside, Stale, StreamGone
+from .errors import SignalGap, SignalOutside, Stale, StreamGone, StreamNotFound
 
 __all__ = ["Action", "Observation", "PolicyLoop", "Report", "Spread"]
 
@@ -138,7 +138,10 @@ class PolicyLoop:
         try:
             streams = dict.fromkeys(images.values())
             self._reader = SetReader(streams, rig, runtime_dir, timeout, max_skew=max_skew)
-            self._sets = Sets(self._reader.rig, runtime_dir, timeout)
+            try:
+                self._sets = Sets(self._reader.rig, runtime_dir, timeout)
+            except StreamNotFound:
+                pass  # a publisher of streams alone
             for name, signal in signals.items():
                 self._signals[name] = SignalReader(signal, runtime_dir, timeout)
         except BaseException:
@@ -195,7 +198,7 @@ class PolicyLoop:
 
     def observe(self) -> Observation | None:
         """Wait for an observation as :meth:`step` does, for a loop of your own; None when there is none to act on."""
-        if self._reader is None or self._sets is None:
+        if self._reader is None:
             raise ValueError("the loop was closed")
         if self._images is None:
             self._images = open_images(self._reader, self._sets, self._max_age)
