@@ -59,6 +59,8 @@ def reads() -> None:
         # There is an image as soon as it is connected.
         color = front.read_latest(60_000)
         for k in range(60):
+            if k % 4 == 0:
+                time.sleep(0.05)  # a newer image is there
             depth = front.read_latest_depth(60_000)
             assert (color.shape, color.dtype, depth.shape, depth.dtype) == ((480, 640, 3), np.uint8, (480, 640, 1), np.uint16)
             of_color, of_depth = numbers(color, depth)
