@@ -53,8 +53,8 @@ def numbers(color: np.ndarray, depth: np.ndarray) -> tuple[int, int]:
 
 def reads() -> None:
     """Images are those of the rig, to the bit, and colour and depth those of one moment."""
-    with camera(use_depth=True, width=640, height=480, fps=30) as front:
-        assert (front.width, front.height, front.fps) == (640, 480, 30)
+    with camera(use_depth=True, width=640, height=480, fps=10) as front:
+        assert (front.width, front.height, front.fps) == (640, 480, 10)
         seen = set()
         # There is an image as soon as it is connected.
         color = front.read_latest(60_000)
@@ -85,7 +85,8 @@ def reads() -> None:
         refused(DeviceAlreadyConnectedError, "already connected", front.connect)
     refused(DeviceNotConnectedError, "not connected", front.read_latest)
     with camera(color_mode="bgr", use_depth=True) as front:
-        assert (front.width, front.height, front.fps) == (640, 480, 30)
+        assert (front.width, front.height) == (640, 480)
+        assert 1 <= front.fps <= 31
         color = front.async_read(WAIT_S * 1e3)
         numbers(color[..., ::-1], front.read_latest_depth(60_000))
     with camera(use_rgb=False, use_depth=True) as front:
@@ -120,7 +121,7 @@ def refuses() -> None:
     refused(ConnectionError, "no rig 'other'|rig 'other'", camera(rig="other", **none).connect)
     refused(ConnectionError, "no rig|not running", camera(runtime_dir="/nonexistent", **none).connect)
     refused(ValueError, r"width = 320, height = 240.*640x480", camera(width=320, height=240).connect)
-    refused(ValueError, r"fps = 60, but the camera delivers", camera(fps=60).connect)
+    refused(ValueError, r"fps = 60, but the camera delivers", camera(fps=60, timeout_s=5.0).connect)
     refused(ValueError, "carries rgb8, which is not depth", camera(use_depth=True, depth_stream="color", use_rgb=False, color_stream="none").connect)
     refused(ValueError, "carries z16", camera(color_stream="depth").connect)
     refused(ValueError, "both false", lambda: camera(use_rgb=False))

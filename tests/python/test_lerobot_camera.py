@@ -112,7 +112,7 @@ def test_a_rig_that_ends_is_a_timeout_and_one_that_comes_back_goes_on(binary: st
 @pytest.mark.skipif(not HAS_OPENCV, reason="LeRobot's recorder needs OpenCV, which .venv-lerobot lacks: make .venv-lerobot/.stamp")
 def test_lerobots_recorder_records_the_rigs_images(binary: str, runtime: Path, rig: Path, beside: Path, checks, tmp_path: Path) -> None:
     out = tmp_path / "dataset"
-    cameras = "{wrist: {type: depthrig, camera: front, use_depth: true, width: 640, height: 480, fps: 30, timeout_s: 60}}"
+    cameras = "{wrist: {type: depthrig, camera: front, use_depth: true, width: 640, height: 480, fps: 10, timeout_s: 60}}"
     options = {
         "robot.type": "still",
         "robot.id": "one",

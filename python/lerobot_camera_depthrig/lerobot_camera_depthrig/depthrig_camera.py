@@ -104,7 +104,7 @@ class DepthrigCamera(Camera):
         try:
             first = reader.next(max(0.0, deadline - time.monotonic()))
             self._check(first)
-            rate = self._rate(reader, first)
+            rate = self._rate(reader, first, deadline)
             self.fps = round(rate) if self.fps is None else self.fps
             if rate * _FASTER < self.fps:
                 raise ValueError(
@@ -136,20 +136,23 @@ class DepthrigCamera(Camera):
                 )
             self.width, self.height = width, height
 
-    def _rate(self, reader: SetReader | _SingleReader, first: Mapping[str, Frame]) -> float:
-        """Return the measured rate of the slowest stream, images a second, those included that were lost."""
-        since = {name: frame.header for name, frame in first.items()}
-        del first
+    def _rate(self, reader: SetReader | _SingleReader, group: Mapping[str, Frame], deadline: float) -> float:
+        """Return the measured rate of the slowest stream, images a second, those included that were lost.
+
+        A busy computer may be late with some; only what is never reached before the deadline is too slow.
+        """
+        since = {name: frame.header for name, frame in group.items()}
         rates: dict[str, float] = {}
-        deadline = time.monotonic() + self.config.timeout_s
-        while len(rates) < len(since):
+        while len(rates) < len(since) or (min(rates.values()) * _FASTER < (self.fps or 0) and time.monotonic() < deadline):
             # Kept, so that there is an image to return from now on.
-            self._take(reader.next(max(0.0, deadline - time.monotonic())))
-            assert self._group is not None
-            for name, frame in self._group.items():
+            group = reader.next(max(0.2, deadline - time.monotonic()))
+            self._take(group)
+            for name, frame in group.items():
                 number = frame.header.captured - since[name].captured
                 if number >= _RATE_FRAMES:
-                    rates[name] = number * 1e9 / (frame.capture_time_ns - since[name].capture_time_ns)
+                    rate = number * 1e9 / (frame.capture_time_ns - since[name].capture_time_ns)
+                    rates[name] = max(rate, rates.get(name, 0.0))
+                    since[name] = frame.header
         return min(rates.values())
 
     @check_if_not_connected
