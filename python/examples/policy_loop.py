@@ -15,11 +15,14 @@ import argparse
 import json
 import math
 import time
+from collections import deque
+from dataclasses import asdict
 
 import torch
 from torch import Tensor, nn
 
 import depthrig
+from depthrig.policy import Observation, PolicyLoop, Spread
 
 JOINTS = 7
 """Six of the arm, and the gripper."""
@@ -136,17 +139,6 @@ class Arm:
         self.joints += (target.cpu() - self.joints) * (1 - math.exp(-seconds / lag_s))
 
 
-def middle(samples: list[float]) -> dict[str, float | None]:
-    """Return median and 99th percentile, milliseconds."""
-    if not samples:
-        return {"p50": None, "p99": None}
-    ordered = sorted(samples)
-    return {
-        "p50": ordered[len(ordered) // 2] * 1e3,
-        "p99": ordered[min(len(ordered) - 1, len(ordered) * 99 // 100)] * 1e3,
-    }
-
-
 def main() -> None:
     """Run the loop and print its budget."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -169,80 +161,52 @@ def main() -> None:
     noise = torch.Generator().manual_seed(options.seed)
     policy = Policy(options.ddim_steps).to(options.device).eval()
     arm = Arm()
-    period = 1 / options.hz
-    times: dict[str, list[float]] = {n: [] for n in ("depth_age", "feed", "torch_copy", "policy", "depth_to_action")}
-    counts = {"actions": 0, "plans": 0, "stale": 0, "late": 0}
+    policy(torch.zeros(8, 8, device=options.device), arm.joints.to(options.device), noise)  # what is done once
     plan: list[Tensor] = []
-    with depthrig.Stream(options.stream, options.rig) as stream:
-        policy(torch.zeros(8, 8, device=options.device), arm.joints.to(options.device), noise)  # what is done once
-        header = stream.next(timeout=10).header
-        start = due = time.monotonic()
-        while time.monotonic() - start < options.seconds:
-            try:
-                # A newer image is a reason to plan anew; without one the plan goes on, if its depth is fresh enough.
-                frame = stream.wait_fresh(options.max_age, timeout=0 if plan else options.max_age)
-            except depthrig.Stale as stale:
-                if not plan or stale.age_s is None or stale.age_s > options.max_age:
-                    counts["stale"] += 1
-                    plan.clear()  # the arm holds still
-                    continue
-            else:
-                got = time.monotonic()
-                header = frame.header
-                depth = frame.torch(options.device, metres=True)
-                frame.release()
-                synchronise(options.device)
-                copied = time.monotonic()
-                times["depth_age"].append(frame.age_s)
-                times["feed"].append(got - header.publish_time_ns / 1e9)
-                actions = policy(depth, arm.joints.to(options.device), noise).cpu()
-                planned = time.monotonic()
-                plan = list(actions[:EXECUTED])
-                counts["plans"] += 1
-                times["torch_copy"].append(copied - got)
-                times["policy"].append(planned - copied)
-                times["depth_to_action"].append(frame.age_s)
-            arm.follow(plan.pop(0), period)
-            counts["actions"] += 1
-            due += period
-            late = time.monotonic() - due
-            if late > 0:
-                counts["late"] += 1
-                due += late
-            time.sleep(max(0.0, -late))
-        missed, restarts = stream.missed, stream.restarts
-    source = {"stream": header.stream_id, "image": f"{header.width}x{header.height} {header.format_name}"}
-    if header.refinement is not None:
-        source |= {"engine": header.refinement.engine, "model": header.refinement.model or "none"}
-    result = {
-        "weights": f"random, seed {options.seed}: the actions mean nothing",
-        **source,
-        "device": options.device,
-        "hz": options.hz,
-        "max_age_ms": options.max_age * 1e3,
-        **counts,
-        "missed": missed,
-        "restarts": restarts,
-        "milliseconds": {name: middle(samples) for name, samples in times.items()},
-        "joints": [round(float(j), 4) for j in arm.joints],
-    }
+    seen_last: list[depthrig.Header] = []
+    copies: deque[float] = deque()
+
+    def act(seen: Observation) -> list[float]:
+        # A newer image is a reason to plan anew; without one the plan goes on.
+        if seen.is_new or not plan:
+            began = time.perf_counter()
+            depth = seen.frames["depth"].torch(options.device, metres=True)
+            synchronise(options.device)
+            copies.append(time.perf_counter() - began)
+            plan[:] = policy(depth, arm.joints.to(options.device), noise).cpu()[:EXECUTED]
+            seen_last[:] = [seen.frames["depth"].header]
+        target = plan.pop(0)
+        arm.follow(target, 1 / options.hz)
+        return target.tolist()
+
+    joints = [f"joint_{i}" for i in range(JOINTS - 1)] + ["gripper"]
+    with (
+        depthrig.Signal("policy_loop/action", joints, unit="rad", kind="joints") as action,
+        PolicyLoop(
+            {"depth": options.stream}, action=action, hz=options.hz, max_age=options.max_age, rig=options.rig, timeout=10
+        ) as loop,
+    ):
+        end = time.monotonic() + options.seconds
+        while time.monotonic() < end:
+            if not loop.step(act):
+                plan.clear()  # the arm holds still
+        report = loop.report()
+    weights = f"random, seed {options.seed}: the actions mean nothing"
+    source: dict[str, object] = {"stream": options.stream, "device": options.device, "plans": len(copies)}
+    for header in seen_last:
+        source["image"] = f"{header.width}x{header.height} {header.format_name}"
+        if header.refinement is not None:
+            source |= {"engine": header.refinement.engine, "model": header.refinement.model or "none"}
+    copy = Spread.of(copies)
     if options.json:
-        print(json.dumps(result, indent=2))
+        result = {"weights": weights, **source, **json.loads(report.to_json()), "torch_copy": copy and asdict(copy)}
+        print(json.dumps({**result, "joints": [round(float(j), 4) for j in arm.joints]}, indent=2))
         return
-    print(f"random weights (seed {options.seed}): the path is real, the actions mean nothing")
-    print(", ".join(f"{k} {v}" for k, v in source.items()) + f", on {options.device}")
-    explained = {
-        "depth_age": "exposure to the policy's input",
-        "feed": "publishing to the received frame",
-        "torch_copy": "the frame to a tensor in metres",
-        "policy": f"the network, {options.ddim_steps} DDIM steps",
-        "depth_to_action": "exposure to the first action",
-    }
-    print(f"{'milliseconds':<18}{'p50':>9}{'p99':>9}")
-    for name, samples in times.items():
-        p50, p99 = (f"{v:.2f}" if v is not None else "-" for v in middle(samples).values())
-        print(f"{name:<18}{p50:>9}{p99:>9}   {explained[name]}")
-    print(", ".join(f"{k} {v}" for k, v in (*counts.items(), ("missed", missed), ("restarts", restarts))))
+    print(f"weights {weights}")
+    print(", ".join(f"{k} {v}" for k, v in source.items()))
+    print(report)
+    if copy is not None:
+        print(f"{'torch copy':<15}{copy.p50_ms:>9.2f}{copy.p99_ms:>9.2f}{copy.max_ms:>9.2f}   the frame to a tensor in metres")
 
 
 def synchronise(device: str) -> None:

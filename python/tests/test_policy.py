@@ -29,17 +29,18 @@ def test_the_loop_acts_on_fresh_depth_and_says_where_its_time_goes(live: Path) -
     result = json.loads(done.stdout)
     assert "random" in result["weights"]
     assert (result["stream"], result["image"], result["stale"]) == ("pattern/z16", "64x48 z16", 0)
-    assert result["actions"] >= result["plans"] >= 1
-    spent = {name: t["p50"] for name, t in result["milliseconds"].items()}
+    assert result["actions"] == result["observations"] >= result["plans"] >= 1
+    spent = {name: result[name]["p50_ms"] for name in ("age", "policy", "age_at_action", "torch_copy")}
     assert all(ms >= 0 for ms in spent.values()), spent
-    assert spent["depth_to_action"] >= spent["policy"]
-    assert spent["depth_to_action"] >= spent["depth_age"] >= spent["torch_copy"]
+    assert spent["age_at_action"] >= spent["policy"] >= spent["torch_copy"]
+    assert spent["age_at_action"] >= spent["age"]
     assert any(joint != 0 for joint in result["joints"]), "the arm moved"
 
 
 def test_the_loop_does_not_act_on_stale_depth(live: Path) -> None:
     done = run(live, "pattern/z16", "--seconds", "0.5", "--max-age", "0.000001", "--threads", "1")
     assert (done.returncode, done.stderr) == (0, "")
-    assert "actions 0, plans 0, stale " in done.stdout
+    assert "plans 0" in done.stdout
+    assert "observations 0, actions 0, late 0, stale " in done.stdout
     assert "stale 0" not in done.stdout
-    assert "random weights" in done.stdout
+    assert "the actions mean nothing" in done.stdout

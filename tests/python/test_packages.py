@@ -67,6 +67,11 @@ def test_the_wheel_with_the_binary_and_the_editable_package_are_one_project() ->
     assert whole["optional-dependencies"] == package["optional-dependencies"]
     with (ROOT / "Cargo.toml").open("rb") as text:
         assert whole["version"] == tomllib.load(text)["workspace"]["package"]["version"]
+    # LeRobot imports installed packages by their name.
+    plugin = project("python/lerobot_camera_depthrig/pyproject.toml")
+    assert (ROOT / "python/lerobot_camera_depthrig" / plugin["name"] / "__init__.py").exists()
+    assert plugin["version"] == whole["version"]
+    assert f"depthrig=={whole['version'].rpartition('.')[0]}.*" in plugin["dependencies"]
 
 
 def test_the_debian_package_has_these_files_and_no_others(binary: str, tree: Path) -> None:

@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+from ._clock_map import ClockMap, MappedTime
 from ._external import ExternalCamera
 from ._external_mode import ExternalMode
 from ._external_session import ExternalSession, Lent
@@ -69,6 +70,7 @@ __all__ = [
     "CameraRefused",
     "CameraServed",
     "ClockDomain",
+    "ClockMap",
     "DepthrigError",
     "Distortion",
     "DropReason",
@@ -86,6 +88,7 @@ __all__ = [
     "HoldingTooMany",
     "Intrinsics",
     "Lent",
+    "MappedTime",
     "MotionFlags",
     "PixelFormat",
     "Pose",

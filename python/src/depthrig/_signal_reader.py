@@ -163,6 +163,11 @@ class SignalReader:
             )
         return between(self._samples[index - 1], self._samples[index], time_ns)
 
+    def _after(self, time_ns: int) -> int | None:
+        """Return the time of the first sample taken in that is not before `time_ns`; None when there is none."""
+        index = bisect_left(self._times, time_ns, self._first)
+        return self._times[index] if index < len(self._times) else None
+
     def wait(self, timeout: float | None = None) -> SignalSample:
         """Wait up to `timeout` seconds (None: as long as it takes) for an unread sample and return the newest one.
 
