@@ -6,6 +6,7 @@ pub mod cameras;
 pub mod cat;
 pub mod cdm;
 pub mod cloud;
+pub mod collect;
 pub mod compare;
 pub mod completions;
 pub mod config;
@@ -53,6 +54,7 @@ pub fn run(cli: Cli) -> Result<Exit> {
         Command::Run(args) => run::run(&args, &context),
         Command::Record(command) => record::run(&command, &context),
         Command::Episode(command) => episode::run(&command, &context),
+        Command::Collect(args) => collect::run(&args, &context),
         Command::Status(args) => status::run(&args, &context),
         Command::Open(args) => open::run(&args, &context),
         Command::Top(args) => top::run(&args, &context),

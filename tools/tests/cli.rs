@@ -38,6 +38,7 @@ fn every_command_has_help_that_fits_and_an_entry_in_the_manual() {
         "top",
         "replay",
         "episode",
+        "collect",
         "info",
         "report",
         "sessions",
@@ -92,7 +93,10 @@ fn every_command_has_help_that_fits_and_an_entry_in_the_manual() {
 #[test]
 fn without_a_rig_commands_say_how_to_start_one() {
     let home = Home::new();
-    for command in [&["status"][..], &["record", "stop"], &["tap", "d435/depth"], &["status", "--json"]] {
+    let collect = &["collect", "--task", "open the drawer"];
+    for command in
+        [&["status"][..], &["record", "stop"], &["tap", "d435/depth"], &["status", "--json"], collect]
+    {
         let ran = home.run(command);
         assert_eq!(ran.code, 1, "{command:?}");
         assert!(ran.err.starts_with("depthrig: error: no rig"), "{command:?}: {}", ran.err);
