@@ -3,8 +3,8 @@
 use crate::args::Global;
 use crate::commands::{
     bench, calibrate, cameras, cat, cdm, cloud, collect, compare, completions, config, demo, doctor, edit,
-    episode, eval, export, import, info, install, man, merge, open, record, recover, replay, report, run,
-    scenes, sessions, status, stereo, tap, top, trim, verify, zed,
+    episode, eval, export, import, info, install, man, merge, open, prune, record, recover, replay, report,
+    run, scenes, sessions, status, stereo, tap, top, trim, verify, zed,
 };
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
@@ -117,6 +117,9 @@ pub enum Command {
     /// Cut a part of a dataset into a new dataset
     #[command(after_help = trim::EXAMPLES)]
     Trim(trim::TrimArgs),
+    /// Remove the sets of discarded episodes from a dataset for good
+    #[command(after_help = prune::EXAMPLES)]
+    Prune(prune::PruneArgs),
     /// Join parts of one recording into one dataset
     #[command(after_help = merge::EXAMPLES)]
     Merge(merge::MergeArgs),

@@ -22,6 +22,7 @@ pub mod install;
 pub mod man;
 pub mod merge;
 pub mod open;
+pub mod prune;
 pub mod record;
 pub mod recover;
 pub mod replay;
@@ -78,6 +79,7 @@ pub fn run(cli: Cli) -> Result<Exit> {
         Command::Cloud(args) => cloud::run(&args, &context),
         Command::Stereo(args) => stereo::run(&args),
         Command::Trim(args) => trim::run(&args, &context),
+        Command::Prune(args) => prune::run(&args, &context),
         Command::Merge(args) => merge::run(&args, &context),
         Command::Recover(args) => recover::run(&args, &context),
         Command::Compare(args) => compare::run(&args, &context),

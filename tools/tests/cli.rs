@@ -49,6 +49,7 @@ fn every_command_has_help_that_fits_and_an_entry_in_the_manual() {
         "compare",
         "trim",
         "merge",
+        "prune",
         "open",
         "config",
         "install",
@@ -138,7 +139,7 @@ fn config_check_names_every_problem_with_its_line() {
 fn what_is_no_dataset_is_refused_by_name() {
     let home = Home::new();
     let text = home.write("notes.txt", "no dataset");
-    for command in ["info", "verify"] {
+    for command in ["info", "verify", "prune"] {
         for path in ["does/not/exist", &text] {
             let ran = home.run(&[command, path]);
             assert_eq!(ran.code, 1, "{command} {path}: {}", ran.err);
