@@ -205,7 +205,7 @@ fn whenever_it_is_killed_one_of_both_datasets_is_there() {
     let exchange = counted.log().iter().position(|line| line.starts_with("exchange")).unwrap() as u64;
     let mut seen = [0, 0];
     // The new dataset is nobody's before that; some operations of its making are enough.
-    for n in (0..exchange - 4).step_by(exchange as usize / 24).chain(exchange - 4..operations) {
+    for n in (0..exchange - 4).step_by(exchange as usize / 60).chain(exchange - 4..operations) {
         let fs = copy(&start).with_fault(Fault::FailFrom(n, io::ErrorKind::Other));
         let result = pruned(&fs);
         let left = copy(&fs);
