@@ -45,12 +45,15 @@ fn the_first_key_is_next_and_others_repeat() {
     // Repetitions, the code of the scanner, and reports between events.
     assert_eq!(pipe.send(&event(5_300_000, 48, 2)), []);
     assert_eq!(pipe.send(&typed(5_300_000, 4, 4, 458_757)), []);
+    assert_eq!(pipe.send(&typed(5_300_000, 2, 48, 0)), []);
     assert_eq!(pipe.send(&[typed(5_300_000, 0, 0, 0), event(5_400_000, 48, 0)].concat()), [Press::Next]);
     assert_eq!(pipe.send(&[event(6_000_000, 30, 1), event(6_100_000, 30, 0)].concat()), [Press::Again]);
     assert_eq!(pipe.send(&[event(7_000_000, 48, 1), event(7_999_999, 48, 0)].concat()), [Press::Next]);
     assert_eq!(pipe.send(&[event(8_000_000, 48, 1), event(9_000_000, 48, 0)].concat()), [Press::Again]);
     // A release without a press: the pedal was held while it was opened.
     assert_eq!(pipe.send(&event(9_000_000, 48, 0)), []);
+    assert_eq!(pipe.send(&[event(10_000_000, 48, 1), event(10_100_000, 30, 0)].concat()), []);
+    assert_eq!(pipe.send(&event(10_200_000, 48, 0)), [Press::Next]);
 }
 
 #[test]
