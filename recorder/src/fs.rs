@@ -5,6 +5,7 @@
 use core::fmt;
 use core::time::Duration;
 use depthrig_bus::files;
+use rustix::fs::{CWD, RenameFlags};
 use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
 use std::os::unix::fs::FileExt;
@@ -46,6 +47,13 @@ pub trait Fs: Send + Sync + fmt::Debug {
     /// # Errors
     /// As the operating system says.
     fn rename(&self, from: &Path, to: &Path) -> io::Result<()>;
+    /// Exchanges the names of two folders in one step.
+    ///
+    /// # Errors
+    /// `Unsupported` where the file system does not offer it, else as the operating system says.
+    fn exchange(&self, _a: &Path, _b: &Path) -> io::Result<()> {
+        Err(io::ErrorKind::Unsupported.into())
+    }
     /// Removes a file.
     ///
     /// # Errors
@@ -217,6 +225,15 @@ impl Fs for RealFs {
 
     fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
         std::fs::rename(from, to)
+    }
+
+    fn exchange(&self, a: &Path, b: &Path) -> io::Result<()> {
+        use rustix::io::Errno;
+        match rustix::fs::renameat_with(CWD, a, CWD, b, RenameFlags::EXCHANGE) {
+            // So say file systems that know no flags of a renaming, and kernels without them.
+            Err(Errno::INVAL | Errno::NOSYS | Errno::OPNOTSUPP) => Err(io::ErrorKind::Unsupported.into()),
+            done => Ok(done?),
+        }
     }
 
     fn remove_file(&self, path: &Path) -> io::Result<()> {

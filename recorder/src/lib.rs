@@ -34,6 +34,7 @@ pub mod npy;
 mod options;
 mod outside;
 pub mod preview;
+mod prune;
 mod recalibrate;
 mod recorder;
 mod recover;
@@ -71,6 +72,7 @@ pub use live::{LiveChannel, LiveEncoder, LiveFrame, LiveSource, LiveTopics};
 pub use msgs::{Diagnostic, Level, SetCounts, StreamAccount};
 pub use options::{ColorCodec, Compression, DepthCodec, LIVE_LATE_NS, RecorderOptions, live_late_ns};
 pub use outside::check_outside;
+pub use prune::{Prunable, PruneProgress, Pruned, prunable, prune};
 pub use recalibrate::{Recalibrated, Recalibration, recalibrate};
 pub use recorder::{DiskStatus, Progress, Recorder, Resumed, Summary, UtcSource};
 pub use recover::{

@@ -152,6 +152,7 @@ impl Edit {
             ),
             "mark" if self.after.is_empty() => format!("mark {} removed", self.before),
             "mark" => format!("marked {}", self.after),
+            "pruned" => format!("pruned: {}", self.before),
             field => format!("{field}: {:?} is now {:?}", self.before, self.after),
         }
     }
@@ -196,7 +197,7 @@ impl core::fmt::Display for Computed {
 /// A step that derived a dataset from others, in `session.toml` under `[[derived]]`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Derived {
-    /// `trim` or `merge`.
+    /// `trim`, `merge` or `prune`.
     pub by: String,
     /// When, UTC nanoseconds since 1970.
     pub utc_ns: i64,

@@ -1,4 +1,5 @@
-//! Cutting and joining: a part of a dataset as a dataset of its own, and parts of one session together again.
+//! Cutting and joining: a part of a dataset as a dataset of its own, a dataset without some of its sets, and parts of one session together
+//! again.
 //!
 //! Sets are copied as they lie in the file, proven on the way and never packed anew. What counts over the whole
 //! recording (accounts, checkpoints, the session's outcome) is written for what the new dataset holds. One thread
@@ -98,6 +99,7 @@ pub fn trim(
         // Notes after the last set and before the next one belong to the last set.
         notes_from_utc_ns: if numbers.start == 0 { i64::MIN } else { times[numbers.start] },
         notes_to_utc_ns: times.get(numbers.end).map_or(i64::MAX, |next| next - 1),
+        prunes: false,
     };
     drop(sets);
     let inputs = [Input::new(dataset)];
@@ -133,6 +135,29 @@ pub fn merge(
     let mut session = session::merged(datasets, out);
     session.derived.push(derived("merge", &inputs, times.0, times.1));
     Join::new(&inputs, track::Range::ALL, *options).without(unread).run(fs, &tracks, session, out, progress)
+}
+
+/// Writes the dataset without the sets of discarded episodes as `out`, with this session, whose outcome is written anew.
+///
+/// # Errors
+/// As [`trim`].
+pub(crate) fn without_discarded(
+    fs: &dyn Fs,
+    dataset: &Dataset,
+    out: &Path,
+    mut session: Session,
+    progress: SliceProgress<'_>,
+) -> Result<SliceReport> {
+    let inputs = [Input::new(dataset)];
+    let pieces = (0..dataset.segments().len()).map(|segment| Piece { input: 0, segment }).collect();
+    let mut kept = dataset.set_reader()?.times().to_vec();
+    kept.retain(|utc_ns| !dataset.session().is_discarded(*utc_ns));
+    let first_utc_ns = kept.first().copied().unwrap_or_default();
+    let last_utc_ns = kept.last().copied().unwrap_or_default();
+    session.outcome = None;
+    session.derived.push(derived("prune", &inputs, first_utc_ns, last_utc_ns));
+    let range = track::Range { prunes: true, ..track::Range::ALL };
+    Join::new(&inputs, range, SliceOptions::default()).run(fs, &[pieces], session, out, progress)
 }
 
 /// The provenance of what is made from `inputs`, with sets from one log time to another.

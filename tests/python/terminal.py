@@ -1,4 +1,4 @@
-"""A terminal for `depthrig top`: a real pseudo-terminal whose other end answers as terminals of some kind do."""
+"""A terminal for `depthrig top` and `collect`: a real pseudo-terminal whose other end answers as terminals of some kind do."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Shown:
 
 
 class Terminal:
-    """A terminal with `top` in it."""
+    """A terminal with a command in it."""
 
     def __init__(self, command: list[str], env: dict[str, str], rows: int, columns: int, answer: bytes) -> None:
         self.answer = answer
@@ -118,7 +118,7 @@ class Terminal:
             time.sleep(0.1)
 
     def ends(self) -> int:
-        """Waits for the end of `top`; the terminal must then be as it was."""
+        """Waits for the end of the command; the terminal must then be as it was."""
         code = self.process.wait(WAIT_S)
         deadline = time.monotonic() + WAIT_S
         while LEAVE not in self.written:
@@ -201,10 +201,11 @@ def terminal(
     columns: int = 120,
     answer: bytes = PLAIN,
     env: dict[str, str] | None = None,
+    command: str = "top",
 ) -> Iterator[Terminal]:
     outside = {name: value for name, value in environment(runtime).items() if name not in ("TMUX", "NO_COLOR")}
     where = {**outside, "TERM": "xterm-256color", **(env or {})}
-    opened = Terminal([binary, "top", *options], where, rows, columns, answer)
+    opened = Terminal([binary, command, *options], where, rows, columns, answer)
     try:
         yield opened
     finally:

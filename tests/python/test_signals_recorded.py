@@ -456,3 +456,58 @@ def test_a_killed_recorder_loses_a_second_at_most(binary: str, runtime: Path, ri
         if channel.topic == "/images/arm/joint_position/joint_states":
             got.append((message.publish_time, flat("arm/joint_position", value)))
     check_all(Recorded(dataset, robot.sent), "arm/joint_position", [(t - offset, v) for t, v in got])
+
+
+def test_a_required_signal_must_come_before_a_recording_begins(
+    binary: str,  # noqa: F811
+    runtime: Path,  # noqa: F811
+    rig: tuple[Path, Path],
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "required.toml"
+    path.write_text(rig[0].read_text() + '\n[[signal]]\nname = "late/joints"\nrequired = true\nsilent_s = 0.5\n')
+
+    def the_signal(code: int) -> dict[str, Any]:
+        deadline = time.monotonic() + WAIT_S
+        while True:
+            call = [binary, "status", "--json"]
+            done = subprocess.run(call, env=environment(runtime), capture_output=True, text=True, check=False)
+            if done.returncode == code:
+                (signal,) = json.loads(done.stdout)["signals"]
+                return dict(signal)
+            assert time.monotonic() < deadline, done.stdout + done.stderr
+            time.sleep(0.1)
+
+    log = tmp_path / "log"
+    with running(binary, runtime, log, "run", str(path), codes=(0, 3)):
+        missing = the_signal(3)
+        assert (missing["signal"], missing["state"], missing["age_s"]) == ("late/joints", "missing", None)
+        call = [binary, "record", "start", "--force"]
+        refused = subprocess.run(call, env=environment(runtime), capture_output=True, text=True, check=False)
+        assert refused.returncode == 1
+        assert "nobody publishes signal late/joints, which this rig requires; start the robot's process" in refused.stderr
+        with publisher(runtime, "late/joints", "a,b", 100) as process:
+            assert the_signal(0)["state"] == "live"
+            dataset = record(binary, runtime, rig[1], "required")
+            wait_for_sets(binary, runtime, 2)
+            os.kill(process.pid, signals.SIGSTOP)
+            silent = the_signal(3)
+            assert silent["state"] == "silent" and silent["age_s"] > 0.5
+            os.kill(process.pid, signals.SIGCONT)
+            assert the_signal(0)["state"] == "live"
+            command(binary, runtime, "record", "stop", codes=(0, 3))
+    said = log.read_text()
+    assert "has been silent for" in said and "signal late/joints comes again" in said
+    assert len(list(decoded(dataset))) > 0
+
+    # `run --record` waits for it.
+    again = tmp_path / "again"
+    call = ["run", str(path), "--record", str(again), "--force"]
+    with running(binary, runtime, tmp_path / "again.log", *call, codes=(0, 3)):
+        the_signal(3)
+        assert not again.exists()
+        with publisher(runtime, "late/joints", "a,b", 100):
+            deadline = time.monotonic() + WAIT_S
+            while not list(again.rglob("session.toml")):
+                assert time.monotonic() < deadline
+                time.sleep(0.1)

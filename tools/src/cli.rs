@@ -2,9 +2,9 @@
 
 use crate::args::Global;
 use crate::commands::{
-    bench, calibrate, cameras, cat, cdm, cloud, compare, completions, config, demo, doctor, edit, episode,
-    eval, export, import, info, install, man, merge, open, record, recover, replay, report, run, scenes,
-    sessions, status, stereo, tap, top, trim, verify, zed,
+    bench, calibrate, cameras, cat, cdm, cloud, collect, compare, completions, config, demo, doctor, edit,
+    episode, eval, export, import, info, install, man, merge, open, prune, record, recover, replay, report,
+    run, scenes, sessions, status, stereo, tap, top, trim, verify, zed,
 };
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
@@ -61,6 +61,9 @@ pub enum Command {
     /// Begin, end, discard and judge demonstrations within a recording
     #[command(subcommand, after_help = episode::EXAMPLES)]
     Episode(episode::EpisodeCommand),
+    /// Collect demonstrations one after the other, with keys or a foot pedal
+    #[command(after_help = collect::EXAMPLES)]
+    Collect(collect::CollectArgs),
     /// Show cameras, rates, losses, clocks, recording and disk of the running daemon
     #[command(after_help = status::EXAMPLES)]
     Status(status::StatusArgs),
@@ -114,6 +117,9 @@ pub enum Command {
     /// Cut a part of a dataset into a new dataset
     #[command(after_help = trim::EXAMPLES)]
     Trim(trim::TrimArgs),
+    /// Remove the sets of discarded episodes from a dataset for good
+    #[command(after_help = prune::EXAMPLES)]
+    Prune(prune::PruneArgs),
     /// Join parts of one recording into one dataset
     #[command(after_help = merge::EXAMPLES)]
     Merge(merge::MergeArgs),

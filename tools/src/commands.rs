@@ -6,6 +6,7 @@ pub mod cameras;
 pub mod cat;
 pub mod cdm;
 pub mod cloud;
+pub mod collect;
 pub mod compare;
 pub mod completions;
 pub mod config;
@@ -21,6 +22,7 @@ pub mod install;
 pub mod man;
 pub mod merge;
 pub mod open;
+pub mod prune;
 pub mod record;
 pub mod recover;
 pub mod replay;
@@ -53,6 +55,7 @@ pub fn run(cli: Cli) -> Result<Exit> {
         Command::Run(args) => run::run(&args, &context),
         Command::Record(command) => record::run(&command, &context),
         Command::Episode(command) => episode::run(&command, &context),
+        Command::Collect(args) => collect::run(&args, &context),
         Command::Status(args) => status::run(&args, &context),
         Command::Open(args) => open::run(&args, &context),
         Command::Top(args) => top::run(&args, &context),
@@ -76,6 +79,7 @@ pub fn run(cli: Cli) -> Result<Exit> {
         Command::Cloud(args) => cloud::run(&args, &context),
         Command::Stereo(args) => stereo::run(&args),
         Command::Trim(args) => trim::run(&args, &context),
+        Command::Prune(args) => prune::run(&args, &context),
         Command::Merge(args) => merge::run(&args, &context),
         Command::Recover(args) => recover::run(&args, &context),
         Command::Compare(args) => compare::run(&args, &context),

@@ -8,6 +8,7 @@ mod bench;
 mod calibrate;
 mod cli;
 mod cloud_image;
+mod collect;
 mod commands;
 mod context;
 mod demo;

@@ -1,4 +1,4 @@
-//! The terminal as `top` and `calibrate capture` use it: a page that is redrawn in place, and keys without Enter.
+//! The terminal as `top`, `collect` and `calibrate capture` use it: a page that is redrawn in place, and keys without Enter.
 
 mod keys;
 
@@ -8,10 +8,12 @@ use anyhow::{Context, Result};
 use core::cell::Cell;
 use core::time::Duration;
 use depthrig_bus::HostTime;
+pub use keys::Key;
 use keys::Keys;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::termios::{self, LocalModes, OptionalActions, Termios};
-use std::io::{IsTerminal, Stdout, Write};
+use std::io::IsTerminal;
+use std::os::fd::BorrowedFd;
 use std::sync::{Mutex, PoisonError};
 
 /// Columns and rows of a terminal that does not say.
@@ -25,18 +27,22 @@ const CLEAR_BELOW: &str = "\x1b[J";
 /// A terminal that takes no byte for this long is not given back.
 const STALLED: Timespec = Timespec { tv_sec: 2, tv_nsec: 0 };
 
+/// Time within which the rest of a sequence follows its ESC, also over a slow connection.
+const ESCAPE: Duration = Duration::from_millis(250);
+
 /// State to give back with a terminal that is taken: the settings of its keyboard, and the messages of panics, which
 /// would be lost with the page.
 static TAKEN: Mutex<Option<Taken>> = Mutex::new(None);
 
 struct Taken {
+    output: BorrowedFd<'static>,
     keyboard: Option<Termios>,
     panics: Vec<String>,
 }
 
 /// The page. Dropping it gives the terminal back as it was.
 pub struct Screen {
-    out: Stdout,
+    out: BorrowedFd<'static>,
     has_keys: bool,
     keys: Cell<Keys>,
 }
@@ -47,14 +53,26 @@ impl Screen {
     /// # Errors
     /// When the output is not a terminal.
     pub fn enter() -> Result<Self> {
-        let out = std::io::stdout();
-        if !out.is_terminal() {
+        if !std::io::stdout().is_terminal() {
             return Err(crate::exit::UsageError(
                 "top needs a terminal; use `depthrig status --watch` to follow a rig in a file or pipe"
                     .into(),
             )
             .into());
         }
+        Self::on(rustix::stdio::stdout())
+    }
+
+    /// Takes the terminal that the standard output or the standard error output is, if there is one.
+    ///
+    /// # Errors
+    /// When it cannot be set up.
+    pub fn of_either_output() -> Result<Option<Self>> {
+        let outputs = [rustix::stdio::stdout(), rustix::stdio::stderr()];
+        outputs.into_iter().find(IsTerminal::is_terminal).map(Self::on).transpose()
+    }
+
+    fn on(out: BorrowedFd<'static>) -> Result<Self> {
         // Keys come at once and unseen; Ctrl-C still is a signal. Without a keyboard there are no keys.
         let keyboard = termios::tcgetattr(std::io::stdin()).ok();
         let has_keys = keyboard.is_some();
@@ -64,11 +82,17 @@ impl Screen {
             termios::tcsetattr(std::io::stdin(), OptionalActions::Now, &raw)
                 .context("the terminal cannot be set up")?;
         }
-        *TAKEN.lock().unwrap_or_else(PoisonError::into_inner) = Some(Taken { keyboard, panics: Vec::new() });
+        *TAKEN.lock().unwrap_or_else(PoisonError::into_inner) =
+            Some(Taken { output: out, keyboard, panics: Vec::new() });
         let screen = Self { out, has_keys, keys: Cell::default() };
         keep_panics();
         screen.put(ENTER)?;
         Ok(screen)
+    }
+
+    /// Its columns and rows.
+    pub fn size(&self) -> (usize, usize) {
+        size_of(self.out).unwrap_or(USUAL)
     }
 
     /// Draws `text` from the top; what does not fit is left out.
@@ -76,7 +100,7 @@ impl Screen {
     /// # Errors
     /// When the terminal is gone.
     pub fn draw(&self, text: &str) -> Result<()> {
-        let (width, height) = size().unwrap_or(USUAL);
+        let (width, height) = self.size();
         self.put(&format!("{}{CLEAR_BELOW}", page(text, width, height)))
     }
 
@@ -85,7 +109,7 @@ impl Screen {
     /// # Errors
     /// When the terminal is gone.
     pub fn draw_top(&self, text: &str, rows: usize) -> Result<()> {
-        let (width, _) = size().unwrap_or(USUAL);
+        let (width, _) = self.size();
         self.put(&page(text, width, rows))
     }
 
@@ -102,9 +126,14 @@ impl Screen {
     /// # Errors
     /// When the terminal is gone.
     pub fn put(&self, text: &str) -> Result<()> {
-        let mut out = self.out.lock();
-        out.write_all(text.as_bytes())?;
-        out.flush()?;
+        let mut rest = text.as_bytes();
+        while !rest.is_empty() {
+            match rustix::io::write(self.out, rest) {
+                Ok(n) => rest = rest.get(n..).unwrap_or_default(),
+                Err(rustix::io::Errno::INTR) => {}
+                Err(e) => return Err(std::io::Error::from(e).into()),
+            }
+        }
         Ok(())
     }
 
@@ -130,15 +159,24 @@ impl Screen {
         Ok(answer)
     }
 
-    /// Waits up to `length` for a key. Keys that send several bytes, such as arrows, and late answers of the terminal are skipped.
-    pub fn key(&self, length: Duration) -> Option<u8> {
+    /// Whether there is a keyboard.
+    pub const fn has_keys(&self) -> bool {
+        self.has_keys
+    }
+
+    /// Waits up to `length` for a key, and a moment longer for what follows ESC. Late answers of the terminal are skipped.
+    pub fn key(&self, length: Duration) -> Option<Key> {
         let until = HostTime::now().plus(length);
         loop {
-            let byte = self.byte(until.from_now())?;
-            let mut keys = self.keys.take();
-            let key = keys.next(byte);
+            let mut keys = self.keys.get();
+            let wait = if keys.is_at_escape() { ESCAPE } else { until.from_now() };
+            let byte = self.byte(wait);
+            let key = match byte {
+                Some(byte) => keys.next(byte),
+                None => keys.end_of_escape(),
+            };
             self.keys.set(keys);
-            if key.is_some() {
+            if key.is_some() || byte.is_none() {
                 return key;
             }
         }
@@ -177,10 +215,9 @@ pub fn restore() {
         let _ = termios::tcsetattr(std::io::stdin(), OptionalActions::Now, keyboard);
     }
     // Not for one that takes no bytes any more: it would keep the process from ending.
-    let stdout = std::io::stdout();
-    let mut fds = [PollFd::new(&stdout, PollFlags::OUT)];
+    let mut fds = [PollFd::new(&taken.output, PollFlags::OUT)];
     if poll(&mut fds, Some(&STALLED)).is_ok_and(|n| n > 0) {
-        let _ = rustix::io::write(&stdout, LEAVE.as_bytes());
+        let _ = rustix::io::write(taken.output, LEAVE.as_bytes());
     }
     for message in taken.panics {
         crate::out::note(message);
@@ -209,7 +246,11 @@ fn page(text: &str, width: usize, height: usize) -> String {
 
 /// Columns and rows of the terminal behind the standard output, if it is one.
 pub fn size() -> Option<(usize, usize)> {
-    let size = termios::tcgetwinsize(std::io::stdout()).ok()?;
+    size_of(rustix::stdio::stdout())
+}
+
+fn size_of(terminal: BorrowedFd<'_>) -> Option<(usize, usize)> {
+    let size = termios::tcgetwinsize(terminal).ok()?;
     (size.ws_col > 0 && size.ws_row > 0).then(|| (size.ws_col.into(), size.ws_row.into()))
 }
 

@@ -38,6 +38,7 @@ fn every_command_has_help_that_fits_and_an_entry_in_the_manual() {
         "top",
         "replay",
         "episode",
+        "collect",
         "info",
         "report",
         "sessions",
@@ -48,6 +49,7 @@ fn every_command_has_help_that_fits_and_an_entry_in_the_manual() {
         "compare",
         "trim",
         "merge",
+        "prune",
         "open",
         "config",
         "install",
@@ -92,7 +94,10 @@ fn every_command_has_help_that_fits_and_an_entry_in_the_manual() {
 #[test]
 fn without_a_rig_commands_say_how_to_start_one() {
     let home = Home::new();
-    for command in [&["status"][..], &["record", "stop"], &["tap", "d435/depth"], &["status", "--json"]] {
+    let collect = &["collect", "--task", "open the drawer"];
+    for command in
+        [&["status"][..], &["record", "stop"], &["tap", "d435/depth"], &["status", "--json"], collect]
+    {
         let ran = home.run(command);
         assert_eq!(ran.code, 1, "{command:?}");
         assert!(ran.err.starts_with("depthrig: error: no rig"), "{command:?}: {}", ran.err);
@@ -134,7 +139,7 @@ fn config_check_names_every_problem_with_its_line() {
 fn what_is_no_dataset_is_refused_by_name() {
     let home = Home::new();
     let text = home.write("notes.txt", "no dataset");
-    for command in ["info", "verify"] {
+    for command in ["info", "verify", "prune"] {
         for path in ["does/not/exist", &text] {
             let ran = home.run(&[command, path]);
             assert_eq!(ran.code, 1, "{command} {path}: {}", ran.err);

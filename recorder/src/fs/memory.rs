@@ -350,6 +350,17 @@ impl Fs for MemFs {
         Ok(())
     }
 
+    fn exchange(&self, a: &Path, b: &Path) -> io::Result<()> {
+        let mut state = self.op("exchange", a)?;
+        if ![a, b].iter().all(|dir| state.dirs.contains(*dir)) {
+            return Err(io::ErrorKind::NotFound.into());
+        }
+        let between = a.with_extension("exchange");
+        state.rename_dir(a, &between)?;
+        state.rename_dir(b, a)?;
+        state.rename_dir(&between, b)
+    }
+
     fn remove_file(&self, path: &Path) -> io::Result<()> {
         let mut state = self.op("remove", path)?;
         let file = state.names.remove(path).ok_or(io::ErrorKind::NotFound)?;

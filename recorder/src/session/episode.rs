@@ -152,6 +152,12 @@ impl Episode {
 }
 
 impl Session {
+    /// Whether a set of this log time is in a discarded episode, and in no other.
+    pub fn is_discarded(&self, utc_ns: i64) -> bool {
+        let mut holding = self.episodes.iter().filter(|e| e.holds(utc_ns)).peekable();
+        holding.peek().is_some() && holding.all(|e| e.discarded)
+    }
+
     /// The episode that runs.
     pub(crate) fn running(&mut self) -> Option<&mut Episode> {
         self.episodes.last_mut().filter(|e| e.is_open())

@@ -46,6 +46,8 @@ struct Head {
     next: Option<Box<SetGroup>>,
     /// The clock pair that the next set's segment begins with.
     clock: Option<Loose>,
+    /// The set before was left out.
+    is_pruned: bool,
     /// Damage since the set before, in words.
     damage: Vec<String>,
     /// There are sets beyond the range.
@@ -159,6 +161,7 @@ impl<'a> Join<'a> {
                     output.set(&set, &source, clock, &self.losses)?;
                 }
                 head.before = Some((set.mark.id, set.mark.sets_offered, source.origin));
+                head.is_pruned = false;
                 drop(set);
                 let after = self.fill(head, output)?;
                 if i == chosen {
@@ -224,7 +227,7 @@ impl<'a> Join<'a> {
             }
             // With the set of another input before it, its own accounts do not count the gap.
             let same = head.before.zip(head.source.as_ref()).is_some_and(|((before, _, origin), source)| {
-                before == id && origin.goes_on(source.origin, inputs)
+                (before == id || head.is_pruned) && origin.goes_on(source.origin, inputs)
             });
             let missing = if same { gap } else { mark.sets_offered.saturating_sub(output.offered + 1) };
             let between = format!("{missing} sets between set {id} and set {}", mark.id);
@@ -289,6 +292,17 @@ impl<'a> Join<'a> {
                         output.before(source, message);
                     }
                 }
+                Item::Pruned(id, offered) => {
+                    let sets = head.gap(self.inputs, offered);
+                    // Only a loss beside a set that stays is one of the new dataset.
+                    let counted = !head.is_pruned && output.last.is_some();
+                    head.books.gap(Gap { sets, counted, offered }, &mut self.losses);
+                    head.before = head.source.as_ref().map(|s| (id, offered, s.origin));
+                    head.is_pruned = true;
+                    for (source, message) in messages.drain(..) {
+                        output.before(source, message);
+                    }
+                }
                 Item::Set(set) => {
                     head.next = Some(set);
                     break;
@@ -332,6 +346,7 @@ impl Head {
             source: None,
             books: Books::default(),
             before: None,
+            is_pruned: false,
             next: None,
             clock: None,
             damage: Vec::new(),

@@ -23,6 +23,8 @@ pub(super) struct Range {
     pub(super) ends: bool,
     pub(super) notes_from_utc_ns: i64,
     pub(super) notes_to_utc_ns: i64,
+    /// Without the sets of discarded episodes.
+    pub(super) prunes: bool,
 }
 
 impl Range {
@@ -33,7 +35,13 @@ impl Range {
         ends: true,
         notes_from_utc_ns: i64::MIN,
         notes_to_utc_ns: i64::MAX,
+        prunes: false,
     };
+
+    /// Whether a set of a dataset within the range is left out.
+    pub(super) fn is_pruned(&self, session: &Session, utc_ns: i64) -> bool {
+        self.prunes && session.is_discarded(utc_ns)
+    }
 
     pub(super) const fn has_note(&self, utc_ns: i64) -> bool {
         self.notes_from_utc_ns <= utc_ns && utc_ns <= self.notes_to_utc_ns
@@ -131,6 +139,8 @@ pub(super) enum Item {
     Source(Arc<Source>, Option<Account>),
     /// A set before the range: its id and how many sets were offered up to it.
     Skipped(u64, u64),
+    /// The same of a set between others, which is left out.
+    Pruned(u64, u64),
     Set(Box<SetGroup>),
     /// Messages between two sets; `head` before the first set of a segment.
     Between {
@@ -237,7 +247,8 @@ pub(super) fn bytes(inputs: &[Input<'_>], track: &[Piece], range: &Range) -> Res
         let inside = reader
             .chunks
             .iter()
-            .filter(|c| (c.end_time as i64) >= range.from_utc_ns && (c.start_time as i64) <= range.to_utc_ns);
+            .filter(|c| (c.end_time as i64) >= range.from_utc_ns && (c.start_time as i64) <= range.to_utc_ns)
+            .filter(|c| !range.is_pruned(inputs[piece.input].dataset.session(), c.start_time as i64));
         total += inside.map(|c| c.length).sum::<u64>();
     }
     Ok(total)
@@ -324,6 +335,7 @@ impl Reading<'_> {
         self.send(Item::Source(Arc::clone(&source), account))?;
         let mut groups = Groups::new(&source.reader, &source.preamble, first)?;
         let file = &source.reader.path;
+        let session = self.inputs[piece.input].dataset.session();
         // Of a file that was cut off between two records nothing else shows that there was more to come.
         let mut has_end = source.reader.finished
             || is_reported_unfinished(self.inputs[piece.input].dataset.session(), file);
@@ -338,6 +350,9 @@ impl Reading<'_> {
                     let account = next_account(&source, &mut groups)?;
                     self.send(Item::Beyond(account))?;
                     return Err(Stop::Enough);
+                }
+                Group::Set(set) if self.range.is_pruned(session, set.log_time as i64) => {
+                    self.send(Item::Pruned(set.mark.id, set.mark.sets_offered))?;
                 }
                 Group::Set(set) => self.send(Item::Set(Box::new(set)))?,
                 Group::Between(between) => {

@@ -4,7 +4,7 @@ use crate::support::*;
 use depthrig_recorder::fs::{Fs, MemFs};
 use depthrig_recorder::{
     Dataset, Edge, Episode, EpisodeEnd, EpisodeOutcome, ErrorKind, NOTE_MAX_BYTES, Recorder, RecoverOptions,
-    SESSION_FILE, SessionChanges, SetSpan, SliceOptions, edit, merge, recover_with, trim,
+    SESSION_FILE, Session, SessionChanges, SetSpan, SliceOptions, edit, merge, recover_with, trim,
 };
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
@@ -169,6 +169,11 @@ fn sets_belong_to_the_episode_that_their_time_is_in() {
     let e = episode(1, 2, 4);
     let inside: Vec<i64> = (0..7).filter(|n| e.holds(T0 + n * PERIOD)).collect();
     assert_eq!(inside, [2, 3, 4]);
-    let open = Episode { end_utc_ns: None, ..e };
+    let open = Episode { end_utc_ns: None, ..e.clone() };
     assert!(open.holds(i64::MAX) && !open.holds(T0));
+    // Somebody may have written spans that overlap: what is in a kept one is not discarded.
+    let gone = Episode { discarded: true, ..episode(2, 3, 6) };
+    let session = Session { episodes: vec![e, gone], ..session() };
+    let discarded: Vec<i64> = (0..9).filter(|n| session.is_discarded(T0 + n * PERIOD)).collect();
+    assert_eq!(discarded, [5, 6]);
 }

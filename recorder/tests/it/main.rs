@@ -14,6 +14,7 @@ mod kill;
 mod kill_busy;
 mod logged;
 mod motion;
+mod prune;
 mod recover;
 mod report;
 mod resume;

@@ -14,7 +14,7 @@ use depthrig_daemon::Showing;
 use depthrig_daemon::config::{CameraConfig, Port, RigConfig};
 use depthrig_daemon::control::{Control, RecordRequest, Shows};
 use depthrig_daemon::rig::{Rig, RigOptions, RigSummary};
-use depthrig_daemon::status::{CameraStatus, RefineState};
+use depthrig_daemon::status::{CameraStatus, RefineState, SignalState};
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 
@@ -75,7 +75,7 @@ pub fn run(args: &RunArgs, context: &Context) -> Result<Exit> {
     let control = rig.control();
     if let Some(directory) = &args.record
         && wait_until_drawn(&rig, &stop, context.global.quiet > 0)
-        && wait_for_refiners(&rig, &refined, &stop, context.global.quiet > 0)
+        && wait_for_inputs(&rig, &refined, &stop, context.global.quiet > 0)
     {
         let request = RecordRequest {
             directory: Some(directory.clone()),
@@ -119,32 +119,31 @@ fn wait_until_drawn(rig: &Rig, stop: &Stop, quiet: bool) -> bool {
     true
 }
 
-/// Waits until the refiners of these cameras run or have failed: the first sets of a recording would lack refined depth.
-/// Returns false when the rig was asked to stop meanwhile.
-fn wait_for_refiners(rig: &Rig, cameras: &[String], stop: &Stop, quiet: bool) -> bool {
+/// Waits until the refiners of these cameras run or have failed, and required signals come: the first sets of a recording would
+/// lack refined depth, or the recording be refused. Returns false when the rig was asked to stop meanwhile.
+fn wait_for_inputs(rig: &Rig, cameras: &[String], stop: &Stop, quiet: bool) -> bool {
     const LOOK: Duration = Duration::from_millis(100);
     let control = rig.control();
     let mut shown = Progress::new(quiet);
-    let is_starting = |camera: &CameraStatus| {
-        cameras.contains(&camera.name)
-            && camera.refine.as_ref().is_some_and(|r| r.state == RefineState::Starting)
+    let is_starting = |c: &CameraStatus| {
+        cameras.contains(&c.name) && c.refine.as_ref().is_some_and(|r| r.state == RefineState::Starting)
     };
-    while !cameras.is_empty() {
+    loop {
         let status = control.status();
+        let required = status.signals.iter().filter(|s| s.required);
+        let silent: Vec<_> = required.clone().filter(|s| s.state != SignalState::Live).collect();
         let starting = status.cameras.iter().filter(|&c| is_starting(c)).count();
-        if starting == 0 {
-            break;
-        }
-        shown.set(
-            "starting refiners, then recording",
-            (cameras.len() - starting) as u64,
-            cameras.len() as u64,
-        );
+        let all = cameras.len() + required.count();
+        let label = match silent.first() {
+            Some(signal) => format!("waiting for signal {}, then recording", signal.signal),
+            None if starting > 0 => "starting refiners, then recording".to_owned(),
+            None => return true,
+        };
+        shown.set(&label, (all - starting - silent.len()) as u64, all as u64);
         if rig.is_stop_asked() || stop.wait(LOOK) {
             return false;
         }
     }
-    true
 }
 
 /// Prints one line even with `--quiet`, because rendering can take minutes.

@@ -2,7 +2,7 @@
 
 use crate::context::Context;
 use crate::exit::Exit;
-use crate::screen::{self, Screen};
+use crate::screen::{self, Key, Screen};
 use crate::signals::Stop;
 use crate::view::{self, Style};
 use crate::wall::{self, Area, Means, Wall};
@@ -87,11 +87,11 @@ pub fn run(args: &TopArgs, context: &Context) -> Result<Exit> {
             refresh = HostTime::now().plus(Duration::from_secs_f64(args.interval));
         }
         top.draw_images()?;
-        let key = top.screen.key(top.wait().min(refresh.from_now()));
-        if stop.is_asked() || matches!(key, Some(b'q' | b'Q')) {
+        let key = top.screen.key(top.wait().min(refresh.from_now())).and_then(Key::letter);
+        if stop.is_asked() || key == Some('q') {
             return Ok(Exit::Good);
         }
-        if matches!(key, Some(b'i' | b'I')) {
+        if key == Some('i') {
             top.toggle_images(args.images.means())?;
         }
     }

@@ -1,7 +1,30 @@
-//! Keys of a terminal, apart from the escape sequences between them: arrows, pasted text, late answers to questions.
+//! Keys of a terminal, apart from the escape sequences between them: pasted text, late answers to questions.
 
 const ESC: u8 = 0x1b;
 const BEL: u8 = 0x07;
+
+/// A key that was pressed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Key {
+    /// One that sends a byte of its own.
+    Byte(u8),
+    /// The left arrow.
+    Left,
+    /// The right arrow.
+    Right,
+    /// Esc.
+    Escape,
+}
+
+impl Key {
+    /// The letter on it in lower case, if there is one.
+    pub const fn letter(self) -> Option<char> {
+        match self {
+            Self::Byte(byte) if byte.is_ascii() => Some(byte.to_ascii_lowercase() as char),
+            _ => None,
+        }
+    }
+}
 
 /// Separates keys from escape sequences (ECMA-48), byte by byte.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -11,8 +34,10 @@ pub enum Keys {
     Plain,
     /// After ESC.
     Escape,
-    /// In a control sequence, which ends with a letter or a sign.
+    /// At the beginning of a control sequence, which ends with a letter or a sign.
     Control,
+    /// Behind a parameter of a control sequence.
+    Parameters,
     /// In a string, such as an answer about images, which ends with BEL or ESC \.
     Text,
     /// After ESC in a string.
@@ -21,9 +46,14 @@ pub enum Keys {
 
 impl Keys {
     /// The key that a byte is, if it is one.
-    pub fn next(&mut self, byte: u8) -> Option<u8> {
+    pub fn next(&mut self, byte: u8) -> Option<Key> {
+        let arrow = match (*self, byte) {
+            (Self::Control, b'C') => Some(Key::Right),
+            (Self::Control, b'D') => Some(Key::Left),
+            _ => None,
+        };
         let state = match *self {
-            Self::Plain if byte != ESC => return Some(byte),
+            Self::Plain if byte != ESC => return Some(Key::Byte(byte)),
             Self::Plain => Self::Escape,
             Self::Escape => match byte {
                 ESC => Self::Escape,
@@ -31,8 +61,8 @@ impl Keys {
                 b'_' | b'P' | b']' | b'^' | b'X' => Self::Text,
                 _ => Self::Plain,
             },
-            Self::Control if (0x40..=0x7e).contains(&byte) => Self::Plain,
-            Self::Control => Self::Control,
+            Self::Control | Self::Parameters if (0x40..=0x7e).contains(&byte) => Self::Plain,
+            Self::Control | Self::Parameters => Self::Parameters,
             Self::Text => match byte {
                 ESC => Self::TextEscape,
                 BEL => Self::Plain,
@@ -42,7 +72,21 @@ impl Keys {
             Self::TextEscape => Self::Text,
         };
         *self = state;
-        None
+        arrow
+    }
+
+    /// Whether the last byte was ESC, which is a key if nothing follows.
+    pub fn is_at_escape(self) -> bool {
+        self == Self::Escape
+    }
+
+    /// The key that ESC is when nothing has followed it.
+    pub fn end_of_escape(&mut self) -> Option<Key> {
+        let is_key = self.is_at_escape();
+        if is_key {
+            *self = Self::Plain;
+        }
+        is_key.then_some(Key::Escape)
     }
 }
 
@@ -52,7 +96,8 @@ mod tests {
 
     fn keys(bytes: &[u8]) -> Vec<u8> {
         let mut keys = Keys::default();
-        bytes.iter().filter_map(|b| keys.next(*b)).collect()
+        let pressed = bytes.iter().filter_map(|b| keys.next(*b));
+        pressed.filter_map(|key| if let Key::Byte(byte) = key { Some(byte) } else { None }).collect()
     }
 
     #[test]
@@ -65,5 +110,17 @@ mod tests {
         assert_eq!(keys(b"\x1b]0;title\x07q"), b"q");
         // The Escape key, and one with Alt.
         assert_eq!(keys(b"\x1b\x1bxq"), b"q");
+    }
+    #[test]
+    fn arrows_and_escape_are_keys() {
+        let mut keys = Keys::default();
+        let pressed: Vec<Key> =
+            b"\x1b[C\x1bOD\x1b[1;5C\x1b[?62;4DN".iter().filter_map(|b| keys.next(*b)).collect();
+        assert_eq!(pressed, [Key::Right, Key::Left, Key::Byte(b'N')]);
+        assert_eq!(keys.end_of_escape(), None);
+        assert_eq!(keys.next(0x1b), None);
+        assert!(keys.is_at_escape());
+        assert_eq!((keys.end_of_escape(), keys.next(b'[')), (Some(Key::Escape), Some(Key::Byte(b'['))));
+        assert_eq!([Key::Byte(b'N').letter(), Key::Left.letter()], [Some('n'), None]);
     }
 }
