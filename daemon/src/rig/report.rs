@@ -22,6 +22,8 @@ pub fn status(inner: &Inner) -> RigStatus {
         c.state().all_streams().map(|s| (s.slots() * s.profile.frame_bytes()) as u64).sum()
     };
     let slots = inner.cameras.iter().filter_map(|c| c.state().streams.iter().map(|s| s.slots()).min()).min();
+    // A statement of its own: its lock is taken again below.
+    let signals = inner.recording().signal_states(&inner.config.signals, now);
     RigStatus {
         rig: inner.config.rig.to_string(),
         version: env!("CARGO_PKG_VERSION").to_owned(),
@@ -30,7 +32,7 @@ pub fn status(inner: &Inner) -> RigStatus {
         utc_ns: UtcPair::sample().utc_ns(now),
         preparing: inner.drawing().map(preparing),
         cameras,
-        signals: inner.recording().signal_states(&inner.config.signals, now),
+        signals,
         sets: sets(inner),
         recording: recording(inner),
         shared_memory: SharedMemoryStatus {

@@ -2,6 +2,7 @@
 
 use super::folder::{FolderState, OutFile, Output};
 use super::report::{ExportReport, PartRecord, StreamCount};
+use depthrig_bus::StreamId;
 use super::source::{EpisodeUse, PART_SETS, Part, Source};
 use crossbeam::channel::{Sender, bounded};
 use depthrig_bus::sync::lock;
@@ -26,6 +27,11 @@ pub trait Exporter: Sync {
     /// The sets of a dataset with episodes that are exported.
     fn episodes(&self) -> EpisodeUse {
         EpisodeUse::Kept
+    }
+
+    /// Whether the samples of this signal are exported; known once it is planned.
+    fn takes(&self, _signal: &StreamId) -> bool {
+        false
     }
 
     /// The options that decide what is written, as recorded in `export.json`. A folder is resumed with equal ones only.
@@ -283,7 +289,7 @@ pub fn export(
         losses: [
             plan.losses.clone(),
             firsts(&sources).filter_map(Source::left_out).collect(),
-            firsts(&sources).filter_map(motion).collect(),
+            firsts(&sources).filter_map(|s| beside_images(s, exporter)).collect(),
             filters,
         ]
         .concat(),
@@ -350,13 +356,16 @@ fn firsts(sources: &[Source]) -> impl Iterator<Item = &Source> {
     sources.iter().filter(|s| s.is_first())
 }
 
-/// The loss of a dataset with IMUs, whose samples no layout takes.
-fn motion(source: &Source) -> Option<String> {
-    let units: Vec<_> = source.session().motion.iter().map(|u| u.id.to_string()).collect();
-    (!units.is_empty()).then(|| {
-        let name = &source.session().name;
-        let units = units.join(", ");
-        format!("{name}: the motion samples of {units} are left out; `depthrig cat --stream` writes them")
+/// The loss of a dataset with IMUs, whose samples no layout takes, or with signals that this one does not take.
+fn beside_images(source: &Source, exporter: &dyn Exporter) -> Option<String> {
+    let session = source.session();
+    let units = session.motion.iter().map(|u| u.id.to_string());
+    let signals = session.signals.iter().filter(|s| !exporter.takes(&s.id)).map(|s| s.id.to_string());
+    let left: Vec<_> = units.chain(signals).collect();
+    (!left.is_empty()).then(|| {
+        let name = &session.name;
+        let left = left.join(", ");
+        format!("{name}: the samples of {left} are left out; `depthrig cat --stream` writes them")
     })
 }
 

@@ -74,6 +74,10 @@ impl Exporter for Lerobot {
         EpisodeUse::Each
     }
 
+    fn takes(&self, signal: &StreamId) -> bool {
+        self.plan.iter().flat_map(|p| &p.schema.vectors).any(|v| v.signals().any(|s| s.id == *signal))
+    }
+
     fn options(&self) -> Value {
         json!(self.options)
     }

@@ -18,6 +18,7 @@ pub(crate) const GAINS: RangeInclusive<u32> = 16..=128;
 /// All cameras of one [`super::SyntheticBackend`] stand on one mount in one world.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
+#[allow(clippy::struct_excessive_bools)] // each is a fact of its own
 pub struct SyntheticConfig {
     /// `d405`, `d415`, `d435`, `d455`, `l515`, `zed2i`, `kinect` or `generic`; see [`super::models`].
     pub model: String,

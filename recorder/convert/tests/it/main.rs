@@ -100,8 +100,8 @@ fn plain(fs: &MemFs, workers: usize) -> Result<ExportReport> {
 }
 
 #[test]
-fn an_export_says_that_it_leaves_out_motion() {
-    let left_out = "session: the motion samples of front/imu, side/imu are left out; `depthrig cat --stream` writes them";
+fn an_export_says_that_it_leaves_out_what_is_no_image() {
+    let left_out = "session: the samples of front/imu, side/imu, arm/joints, arm/gripper are left out; `depthrig cat --stream` writes them";
     assert_eq!(plain(&dataset(2), 1).unwrap().losses, ["images", left_out]);
 }
 
