@@ -18,7 +18,6 @@ WORDS = [  # pattern, what to write
     (r"crews?", "workers, worker pool"),
     (r"entrances?|(?<!docking )stations?|houses?|keeps? house", "queue, worker, housekeeping"),
     (r"in flight|flights?(?<!of-flight)(?<!of flight)", "transfer, submitted"),
-    (r"joints", "late streams"),
     (r"is no (?!longer|such)[a-z]+|are no [a-z]+ (?:of|that)|is none|are none|cannot be(?=[.,;:]| and | or |$)", "invalid X, unsupported X, out of range A..=B"),
     (r"tells?|told|telling", "reports, prints, returns, logs"),
     (r"gave way|gives way|passed over|passes over", "skipped, superseded, dropped"),

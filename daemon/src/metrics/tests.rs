@@ -23,6 +23,7 @@ fn refine() -> RefineStatus {
     }
 }
 
+#[allow(clippy::too_many_lines)] // one literal
 fn rig() -> RigStatus {
     let stream = |id: &str, dropped: &[(&str, u64)]| StreamStatus {
         id: id.into(),

@@ -64,7 +64,9 @@ impl Units {
             dropped: DropCounts::default(),
         };
         let mut waiting = Waiting::new();
-        units.iter().for_each(|s| waiting.add_source(most(s)));
+        for unit in units {
+            waiting.add_source(most(unit));
+        }
         Self { units: units.iter().map(unit).collect(), waiting }
     }
 

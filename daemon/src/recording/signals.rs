@@ -141,7 +141,9 @@ impl Signals {
     /// Those that the recording begins with, in the order of its session.
     pub(super) fn new(records: Vec<SignalRecord>) -> Self {
         let mut signals = Self { sources: Vec::new(), waiting: Waiting::new(), refused: BTreeSet::new() };
-        records.into_iter().for_each(|record| signals.add(record));
+        for record in records {
+            signals.add(record);
+        }
         signals
     }
 

@@ -20,7 +20,7 @@ struct Item<T> {
     /// Its place among all that came.
     number: u64,
     weight: u64,
-    item: T,
+    value: T,
 }
 
 impl<T> Waiting<T> {
@@ -37,7 +37,7 @@ impl<T> Waiting<T> {
     pub(super) fn push(&mut self, source: usize, weight: u64, item: T) -> u64 {
         let Some(queue) = self.queues.get_mut(source) else { return 0 };
         self.came += 1;
-        queue.items.push_back(Item { number: self.came, weight, item });
+        queue.items.push_back(Item { number: self.came, weight, value: item });
         queue.weight = queue.weight.saturating_add(weight);
         queue.shrink()
     }
@@ -63,14 +63,14 @@ impl<T> Waiting<T> {
     /// Takes the items of a source, oldest first.
     pub(super) fn take(&mut self, source: usize) -> impl Iterator<Item = T> + use<T> {
         let items = self.queues.get_mut(source).map(Queue::take);
-        items.into_iter().flatten().map(|i| i.item)
+        items.into_iter().flatten().map(|i| i.value)
     }
 
     /// Takes the items of all sources in the order in which they came.
     pub(super) fn take_all(&mut self) -> Vec<T> {
         let mut items: Vec<_> = self.queues.iter_mut().flat_map(Queue::take).collect();
         items.sort_unstable_by_key(|i| i.number);
-        items.into_iter().map(|i| i.item).collect()
+        items.into_iter().map(|i| i.value).collect()
     }
 }
 

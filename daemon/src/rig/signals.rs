@@ -36,7 +36,7 @@ impl Inner {
     }
 }
 
-/// What is wrong with a signal that the rig requires, in words.
+/// The trouble of a signal that the rig requires, in words; `None` without.
 fn trouble(signal: &SignalStatus) -> Option<String> {
     let name = &signal.signal;
     match signal.state {

@@ -146,6 +146,7 @@ impl Fake {
             uptime_s: 12.5,
             utc_ns: 1_700_000_000_123_456_789,
             preparing: Some(PreparingStatus { images: 3, images_total: 12, share: 0.25, error: None }),
+            signals: Vec::new(),
             cameras: vec![
                 camera("d435", CameraState::Streaming, None),
                 camera("d405", CameraState::Reconnecting, Some("unplugged")),

@@ -2,9 +2,9 @@
 
 use super::folder::{FolderState, OutFile, Output};
 use super::report::{ExportReport, PartRecord, StreamCount};
-use depthrig_bus::StreamId;
 use super::source::{EpisodeUse, PART_SETS, Part, Source};
 use crossbeam::channel::{Sender, bounded};
+use depthrig_bus::StreamId;
 use depthrig_bus::sync::lock;
 use depthrig_recorder::fs::Fs;
 use depthrig_recorder::{Dataset, DatasetSet, PixelMode, SetReader};

@@ -66,11 +66,12 @@ impl Vector {
     ) -> Result<Vec<Self>> {
         let Some(first) = sources.first() else { return Ok(Vec::new()) };
         let all = &first.session().signals;
-        let is_action = |id: &StreamId| match options.action.is_empty() {
-            true => [id.camera.to_string(), id.stream.to_string()]
-                .iter()
-                .any(|name| name == "action" || name.starts_with("action_")),
-            false => options.action.contains(id),
+        let is_action = |id: &StreamId| {
+            if !options.action.is_empty() {
+                return options.action.contains(id);
+            }
+            let names = [id.camera.to_string(), id.stream.to_string()];
+            names.iter().any(|name| name == "action" || name.starts_with("action_"))
         };
         let named =
             |ids: &[StreamId]| ids.iter().map(|id| find(first, id).cloned()).collect::<Result<Vec<_>>>();
@@ -223,8 +224,8 @@ fn around(source: &Source, times: &[i64], options: &VectorOptions) -> Range<usiz
 /// within [`EDGE_NS`].
 fn edges(tracks: &[Vec<Track>], times: &[i64]) -> impl Iterator<Item = usize> + use<> {
     let all = || tracks.iter().flatten();
-    let begin = all().map(|t| t.outside(t.rows.iter())).max().unwrap_or(0);
-    let end = all().map(|t| t.outside(t.rows.iter().rev())).max().unwrap_or(0);
+    let begin = all().map(|t| outside(t.rows.iter())).max().unwrap_or(0);
+    let end = all().map(|t| outside(t.rows.iter().rev())).max().unwrap_or(0);
     let n = times.len();
     let is_short = |rows: Range<usize>| {
         let span = times.get(rows.clone()).and_then(|t| Some(t.last()? - t.first()?)).unwrap_or(0);
@@ -233,6 +234,11 @@ fn edges(tracks: &[Vec<Track>], times: &[i64]) -> impl Iterator<Item = usize> + 
     let begin = if is_short(0..begin) { begin } else { 0 };
     let end = if is_short(n - end..n) { end } else { 0 };
     (0..begin).chain((n - end).max(begin)..n)
+}
+
+/// How many of these rows lie outside of the samples before the first that does not.
+fn outside<'c>(rows: impl Iterator<Item = &'c Cell>) -> usize {
+    rows.take_while(|c| c.why == Some(Why::Outside)).count()
 }
 
 /// One row for each moment from the signals of a vector.
@@ -296,16 +302,12 @@ impl Track {
         let newest = numbers(&sample);
         self.series.push(sample).map_err(fail)?;
         while let Some(time) = times.get(self.rows.len()).filter(|t| **t <= time_ns) {
-            let cell = match self.series.at(HostTime::from_ns(*time), self.max_gap) {
-                Ok(at) => {
-                    self.held = numbers(&at);
-                    Cell { values: self.held.clone(), why: None }
-                }
-                Err(_) => {
-                    let why = if self.is_begun { Why::Gap } else { Why::Outside };
-                    Cell { values: self.held.clone(), why: Some(why) }
-                }
-            };
+            let at = self.series.at(HostTime::from_ns(*time), self.max_gap).ok();
+            if let Some(at) = &at {
+                self.held = numbers(at);
+            }
+            let why = if self.is_begun { Why::Gap } else { Why::Outside };
+            let cell = Cell { values: self.held.clone(), why: at.is_none().then_some(why) };
             self.rows.push(cell);
         }
         self.is_begun = true;
@@ -318,11 +320,6 @@ impl Track {
         while self.rows.len() < n {
             self.rows.push(Cell { values: self.held.clone(), why: Some(Why::Outside) });
         }
-    }
-
-    /// The number of the first of these rows that lie outside of its samples.
-    fn outside<'c>(&self, rows: impl Iterator<Item = &'c Cell>) -> usize {
-        rows.take_while(|c| c.why == Some(Why::Outside)).count()
     }
 
     /// The error if it has no value at a moment that is exported.

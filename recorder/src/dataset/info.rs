@@ -290,7 +290,7 @@ impl SignalInfo {
     }
 }
 
-/// What the session says, before anything is counted.
+/// The session's part, before anything is counted.
 fn uncounted(dataset: &Dataset) -> DatasetInfo {
     let session = dataset.session();
     DatasetInfo {

@@ -166,7 +166,7 @@ pub fn signal_sample(record: &SignalRecord, k: u64) -> SignalSample {
     SignalSample::new(header, &record.description, values).unwrap()
 }
 
-/// What the signals publish between set `n` and the one before.
+/// The samples that the signals publish between set `n` and the one before.
 pub fn signals(session: &Session, n: u64) -> Vec<RecordSignal> {
     let samples = |record| {
         let numbers = n * SIGNAL_SAMPLES..(n + 1) * SIGNAL_SAMPLES;

@@ -56,6 +56,46 @@ fn lost(dataset: &Dataset, info: &DatasetInfo) -> Vec<String> {
     lost
 }
 
+/// Tables of IMUs and signals.
+fn beside_images(info: &DatasetInfo) -> Vec<String> {
+    let mut lines = Vec::new();
+    if !info.motion.is_empty() {
+        lines.push(String::new());
+        lines.push(out::table(
+            &["IMU", "model", "samples", "Hz", "batches", "lost"],
+            2,
+            info.motion.iter().map(|m| {
+                vec![
+                    m.unit.clone(),
+                    m.model.clone(),
+                    m.samples.to_string(),
+                    format!("{:.1}", m.rate_hz),
+                    m.batches.to_string(),
+                    m.lost_batches.to_string(),
+                ]
+            }),
+        ));
+    }
+    if !info.signals.is_empty() {
+        lines.push(String::new());
+        lines.push(out::table(
+            &["signal", "kind", "samples", "Hz", "lost", "restarts"],
+            2,
+            info.signals.iter().map(|s| {
+                vec![
+                    s.signal.clone(),
+                    s.kind.to_owned(),
+                    s.samples.to_string(),
+                    format!("{:.1}", s.rate_hz),
+                    s.lost.to_string(),
+                    s.restarts.to_string(),
+                ]
+            }),
+        ));
+    }
+    lines
+}
+
 /// Describes the dataset as text.
 fn text(info: &DatasetInfo, lost: &[String]) -> String {
     let ms = |ns: i64| ns as f64 / 1e6;
@@ -124,40 +164,7 @@ fn text(info: &DatasetInfo, lost: &[String]) -> String {
         lines.push(format!("{}, {used} for exports", out::count(info.episodes.len(), "episode")));
         lines.extend(info.episodes.iter().map(|e| format!("  {}", printable::line(&e.text()))));
     }
-    if !info.motion.is_empty() {
-        lines.push(String::new());
-        lines.push(out::table(
-            &["IMU", "model", "samples", "Hz", "batches", "lost"],
-            2,
-            info.motion.iter().map(|m| {
-                vec![
-                    m.unit.clone(),
-                    m.model.clone(),
-                    m.samples.to_string(),
-                    format!("{:.1}", m.rate_hz),
-                    m.batches.to_string(),
-                    m.lost_batches.to_string(),
-                ]
-            }),
-        ));
-    }
-    if !info.signals.is_empty() {
-        lines.push(String::new());
-        lines.push(out::table(
-            &["signal", "kind", "samples", "Hz", "lost", "restarts"],
-            2,
-            info.signals.iter().map(|s| {
-                vec![
-                    s.signal.clone(),
-                    s.kind.to_owned(),
-                    s.samples.to_string(),
-                    format!("{:.1}", s.rate_hz),
-                    s.lost.to_string(),
-                    s.restarts.to_string(),
-                ]
-            }),
-        ));
-    }
+    lines.extend(beside_images(info));
     let mut add = |what: &str, text: &str| lines.push(format!("{what}: {}", printable::line(text)));
     if let Some(c) = &info.calibration {
         let attached = c.attached_utc_ns.map_or_else(

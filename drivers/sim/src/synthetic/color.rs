@@ -302,7 +302,7 @@ mod tests {
     #[test]
     fn the_fixed_world_keeps_its_images() {
         let rays = Rays::new(&Intrinsics::pinhole(130.0, 130.0, 119.0, 80.0), 240, 160);
-        let world = World::fixed(None);
+        let world = World::fixed(Vec::new());
         let view = View::new(&rays, &motion::mount(4, 12));
         let sum =
             |bytes: &[u8]| bytes.iter().fold(1u64, |h, b| (h ^ u64::from(*b)).wrapping_mul(0x0100_0000_01B3));

@@ -200,14 +200,14 @@ mod tests {
         let model = models::find(model).unwrap();
         let k = Intrinsics::pinhole(130.0, 130.0, 119.0, 80.0);
         let rays = Rays::new(&k, 240, 160);
-        let world = World::fixed(None);
+        let world = World::fixed(Vec::new());
         (k, render(&world, &View::new(&rays, &motion::mount(pose, 12)), model, 5))
     }
 
     /// The truth is checked against distances to the solids, which the intersections do not use.
     #[test]
     fn every_true_depth_lies_on_a_surface() {
-        let world = World::fixed(None);
+        let world = World::fixed(Vec::new());
         for (name, unit) in [("d405", 0.0001), ("l515", 0.00025)] {
             let (k, pair) = pair(name, 3);
             let camera = motion::mount(3, 12);

@@ -194,7 +194,7 @@ impl Scene {
     /// Every plane at `pose`.
     fn render(&self, rays: &Rays, pose: u32) -> Vec<Vec<u8>> {
         let Self { config, model, .. } = self;
-        let world = &World::fixed(config.arm.then(|| Arm::in_pose(pose)));
+        let world = &World::fixed(if config.arm { Arm::in_pose(pose).things() } else { Vec::new() });
         let camera = config.true_pose().compose(&self.profile.pose_in_device).to_affine();
         let mount =
             if config.arm { motion::mount(0, 1) } else { motion::mount(pose, config.rendered_poses()) };

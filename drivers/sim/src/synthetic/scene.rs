@@ -1,7 +1,6 @@
 //! The world that a camera sees, and the fixed one that all simulated cameras share: a room with a table and the things that give depth cameras
 //! trouble: thin, transparent, mirroring, dark, shiny and plain ones.
 
-use super::arm::Arm;
 use super::shape::{Shape, Solid};
 use super::texture::{Look, Paint, Surface};
 use glam::{Mat3, Quat, Vec3};
@@ -92,13 +91,13 @@ pub(crate) struct World {
 }
 
 impl World {
-    /// Builds the fixed scene of the simulated cameras, which is always the same one, with an arm on the table if there is one.
-    pub(crate) fn fixed(arm: Option<Arm>) -> Self {
+    /// Builds the fixed scene of the simulated cameras, which is always the same one, with `more` things in it.
+    pub(crate) fn fixed(more: Vec<Thing>) -> Self {
         let mut b = Builder { things: Vec::new() };
         b.furniture();
         b.table_setting();
         b.fork();
-        b.things.extend(arm.iter().flat_map(Arm::things));
+        b.things.extend(more);
         Self {
             things: b.things,
             lamps: vec![LAMP],
@@ -352,7 +351,7 @@ mod tests {
 
     #[test]
     fn every_ray_ends_somewhere_in_the_room() {
-        let world = World::fixed(None);
+        let world = World::fixed(Vec::new());
         let all = world.all();
         let from = Vec3::new(0.0, -0.6, 0.5);
         for i in 0..5000u32 {
@@ -372,7 +371,7 @@ mod tests {
 
     #[test]
     fn nothing_but_glass_lets_light_through() {
-        let world = World::fixed(None);
+        let world = World::fixed(Vec::new());
         let all = world.all();
         let from = Vec3::new(0.19, -0.3, 0.1);
         let wall =

@@ -196,7 +196,7 @@ mod tests {
     /// Casting with tiles finds exactly what casting against everything finds.
     #[test]
     fn tiles_miss_nothing() {
-        let world = World::fixed(None);
+        let world = World::fixed(Vec::new());
         let rays = Rays::new(&Intrinsics::pinhole(110.0, 110.0, 99.5, 60.0), 200, 121);
         for pose in [0, 7] {
             let view = View::new(&rays, &motion::mount(pose, 12));
@@ -214,7 +214,7 @@ mod tests {
 
     #[test]
     fn nothing_between_two_balls_is_left_out() {
-        let world = World::fixed(None);
+        let world = World::fixed(Vec::new());
         let all = world.all();
         let lamp = Ball::of(&world.lamps[0]);
         let mut met = 0;

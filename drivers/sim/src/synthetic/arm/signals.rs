@@ -40,12 +40,12 @@ impl ArmSignals {
         Ok(Self { joints, gripper, action, _place: place })
     }
 
-    /// Publishes the arm a hundred times a second until it is told to end.
+    /// Publishes the arm a hundred times a second until it is over.
     ///
     /// # Errors
     /// Of a channel.
-    pub fn run(&mut self, is_ended: impl Fn() -> bool) -> Result<()> {
-        while !is_ended() {
+    pub fn run(&mut self, is_over: impl Fn() -> bool) -> Result<()> {
+        while !is_over() {
             let now = HostTime::now();
             let arm = Arm::at(now);
             self.joints.publish_at(&Stamp::at(now), arm.joints_rad)?;
