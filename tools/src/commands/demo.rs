@@ -17,7 +17,7 @@ use depthrig_bus::{Bus, HostTime, Name, RuntimeDir, StreamId, UtcPair};
 use depthrig_cdm::Precision;
 use depthrig_cdm::stage::{EngineChoice, RefineConfig};
 use depthrig_daemon::config::{CameraConfig, RigConfig};
-use depthrig_daemon::control::{EpisodeRequest, RecordRequest};
+use depthrig_daemon::control::{Control, EpisodeRequest, RecordRequest};
 use depthrig_daemon::rig::{Rig, RigSummary};
 use depthrig_daemon::status::{CameraStatus, RigStatus};
 use depthrig_driver::StreamRequest;
@@ -56,6 +56,8 @@ pub struct DemoArgs {
     json: bool,
 }
 
+/// The rig reads new signals after this at the latest, however busy the computer is.
+const TIMEOUT: Duration = Duration::from_secs(10);
 /// Name of the dataset's folder in the demo's folder.
 const DATASET: &str = "dataset";
 
@@ -106,6 +108,7 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Exit> {
         seeded,
         units_mm: recorded.seen.units_mm,
         recorded: report::modes(info.streams.iter().map(|s| (s.stream.as_str(), s.frames))),
+        signals: info.signals,
         unavailable,
         untrained,
         sets_seen: recorded.seen.sets,
@@ -266,6 +269,7 @@ fn record(
                 force: true, // some seconds; it is the recording that says when the disk is full
                 ..RecordRequest::default()
             };
+            wait_for_signals(&*control)?;
             control.record_start(&request)?;
             control.episode(&EpisodeRequest::Start {
                 task: "carry nothing from the ball to the plate".into(),
@@ -290,6 +294,19 @@ fn record(
     let began = HostTime::now();
     let summary = rig.stop();
     Ok(Recorded { stop_s: began.elapsed().as_secs_f64(), live, seen, summary })
+}
+
+/// Waits until the rig reads the arm's signals: then they are in the recording from its beginning.
+fn wait_for_signals(control: &dyn Control) -> Result<()> {
+    const LOOK: Duration = Duration::from_millis(20);
+    let end = HostTime::now().plus(TIMEOUT);
+    while control.status().signals.len() < ArmSignals::COUNT {
+        if end.from_now().is_zero() {
+            bail!("the rig does not read the signals of the simulated arm");
+        }
+        std::thread::sleep(LOOK);
+    }
+    Ok(())
 }
 
 fn show_recording(seconds: f64, stop: &Stop, quiet: bool) {

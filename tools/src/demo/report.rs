@@ -9,7 +9,7 @@ use crate::exit::Exit;
 use crate::out;
 use depthrig_daemon::rig::RigSummary;
 use depthrig_daemon::status::{CameraState, CameraStatus, RefineState, RigStatus, StreamStatus};
-use depthrig_recorder::{SetDrop, VerifyReport};
+use depthrig_recorder::{SetDrop, SignalInfo, VerifyReport};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -33,6 +33,8 @@ pub struct DemoReport {
     pub units_mm: BTreeMap<String, f64>,
     /// Images of each depth mode in the recording.
     pub recorded: BTreeMap<String, u64>,
+    /// Signals in the recording: those of the simulated arm.
+    pub signals: Vec<SignalInfo>,
     /// Depth modes that the rig asks for and that are not there, with the reason.
     pub unavailable: Vec<String>,
     /// Depth modes whose network was never trained.
@@ -184,6 +186,13 @@ impl DemoReport {
                 ok(self.unrecorded().next().is_none()),
                 self.recorded.len(),
                 self.recorded.iter().map(|(mode, n)| format!("{mode} {n}")).collect::<Vec<_>>().join(", ")
+            ),
+            format!(
+                "{} signals  {} samples of the simulated arm: {}; {} lost",
+                ok(self.signals.iter().all(|s| s.lost == 0)),
+                self.signals.iter().map(|s| s.samples).sum::<u64>(),
+                self.signals.iter().map(|s| s.signal.to_string()).collect::<Vec<_>>().join(", "),
+                self.signals.iter().map(|s| s.lost).sum::<u64>()
             ),
             format!("{} verify   {}", ok(verify::exit(&self.verify) != Exit::Failed), verify::summary(&self.verify)),
             format!(

@@ -122,6 +122,7 @@ fn good(dir: &Path) -> DemoReport {
         seeded: Seeded::default(),
         units_mm: BTreeMap::new(),
         recorded: BTreeMap::from([("d435".to_owned(), 2)]),
+        signals: Vec::new(),
         unavailable: Vec::new(),
         untrained: Vec::new(),
         sets_seen: 2,

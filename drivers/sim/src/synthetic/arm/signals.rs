@@ -22,6 +22,9 @@ pub struct ArmSignals {
 }
 
 impl ArmSignals {
+    /// How many they are.
+    pub const COUNT: usize = 3;
+
     /// Opens the channels.
     ///
     /// # Errors
