@@ -19,6 +19,7 @@ import depthrig
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from depthrig.policy import Observation, PolicyLoop
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from test_daemon import ROOT, WAIT_S, binary, command, environment, running, runtime
@@ -194,6 +195,48 @@ def test_lerobot_trains_on_it(binary: str, runtime: Path, recovered: Path, tmp_p
     losses = said["losses"]
     assert len(losses) == 20 and np.isfinite(losses).all()
     assert np.mean(losses[-5:]) < np.mean(losses[:5])
+
+
+def replayed(binary: str, runtime: Path, dataset: Path, log: Path) -> list[tuple[int, bytes, bytes]]:  # noqa: F811
+    """Time, joints and pixels of each observation of a policy in a replay."""
+    seen: list[tuple[int, bytes, bytes]] = []
+
+    def policy(observation: Observation) -> None:
+        pixels = observation["color"].tobytes() + observation["depth"].tobytes()
+        seen.append((observation.time_ns, observation["joints"].tobytes(), pixels))
+
+    call = ["replay", str(dataset), "--as-fast-as-possible", "--paused", "-q"]
+    images = {"color": "top/color", "depth": "top/depth"}
+    with running(binary, runtime, log, *call, codes=(0, 3)):
+        deadline = time.monotonic() + WAIT_S
+        while not (runtime / "cell.sock").exists():
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        options = {"rig": "cell", "runtime_dir": runtime, "max_gap": 0.2, "max_skew": 0.1, "timeout": WAIT_S}
+        with PolicyLoop(images, {"joints": "arm/joint_position"}, **options) as loop:
+            command(binary, runtime, "replay", "resume")
+            loop.run(policy)
+    return seen
+
+
+def test_a_policy_sees_the_same_twice_in_a_replay(
+    binary: str,  # noqa: F811
+    runtime: Path,  # noqa: F811
+    recovered: Path,
+    tmp_path: Path,
+) -> None:
+    first = replayed(binary, runtime, recovered, tmp_path / "log")
+    assert len(first) >= 20
+    assert replayed(binary, runtime, recovered, tmp_path / "log") == first
+    # The arm is where its process said, at the time of the image.
+    at, values = samples(recovered, "/cell/arm/joint_position/joint_states", "position")
+    with next(recovered.glob("seg_*.mcap")).open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        offset = next(d.utc_offset_ns for _, _, _, d in reader.iter_decoded_messages(topics=["/cell/frame_set"]))
+    for time_ns, joints, _ in first:
+        when = time_ns + offset - at[0]
+        expected = [np.interp(when, at - at[0], values[:, i]) for i in range(len(JOINTS))]
+        np.testing.assert_allclose(np.frombuffer(joints), expected, rtol=0, atol=1e-12)
 
 
 def test_a_gap_is_named_and_refused_or_masked(binary: str, runtime: Path, tmp_path: Path) -> None:  # noqa: F811
