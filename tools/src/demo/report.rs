@@ -191,7 +191,7 @@ impl DemoReport {
                 "{} signals  {} samples of the simulated arm: {}; {} lost",
                 ok(self.signals.iter().all(|s| s.lost == 0)),
                 self.signals.iter().map(|s| s.samples).sum::<u64>(),
-                self.signals.iter().map(|s| s.signal.to_string()).collect::<Vec<_>>().join(", "),
+                self.signals.iter().map(|s| s.signal.as_str()).collect::<Vec<_>>().join(", "),
                 self.signals.iter().map(|s| s.lost).sum::<u64>()
             ),
             format!("{} verify   {}", ok(verify::exit(&self.verify) != Exit::Failed), verify::summary(&self.verify)),
