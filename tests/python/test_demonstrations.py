@@ -6,6 +6,7 @@ The values that must be in the export are NumPy's interpolation of the samples a
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import signal
@@ -19,9 +20,11 @@ import depthrig
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import zarr
 from depthrig.policy import Observation, PolicyLoop
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from PIL import Image
 from test_daemon import ROOT, WAIT_S, binary, command, environment, running, runtime
 
 __all__ = ["binary", "runtime"]
@@ -174,6 +177,33 @@ def test_the_export_has_the_arm_as_it_was_at_each_set(
     all_states = np.array([r["observation.state"] for r in rows])
     for name, value in [("min", all_states.min(0)), ("max", all_states.max(0)), ("mean", all_states.mean(0))]:
         np.testing.assert_allclose(stats["observation.state"][name], value, rtol=1e-5, atol=1e-6)
+
+
+def test_zarr_has_the_rows_of_lerobot(binary: str, runtime: Path, recovered: Path, tmp_path: Path) -> None:  # noqa: F811
+    lerobot, out = tmp_path / "lerobot", tmp_path / "replay.zarr"
+    command(binary, runtime, "export", "lerobot", str(recovered), str(lerobot), codes=(0, 3))
+    command(binary, runtime, "export", "zarr", str(recovered), str(out), codes=(0, 3))
+    rows = exported_rows(lerobot)
+    root = zarr.open(str(out), mode="r")
+    data = root["data"]
+    ends = root["meta/episode_ends"][:]
+    episodes = np.array([r["episode_index"] for r in rows])
+    assert list(ends) == [int(np.sum(episodes <= e)) for e in range(len(ends))]
+    assert list(data["utc_ns"][:]) == [r["capture.utc_ns"] for r in rows]
+    for name, column in [("state", "observation.state"), ("action", "action")]:
+        np.testing.assert_array_equal(data[name][:], np.array([r[column] for r in rows], dtype=np.float32))
+        assert not data[f"missing_{name}"][:].any()
+    for i, row in enumerate(rows):
+        color = Image.open(io.BytesIO(row["observation.images.top_color"]["bytes"])).convert("RGB")
+        # Two decoders of JPEG.
+        assert np.abs(data["top_color"][i].astype(int) - np.asarray(color).astype(int)).max() <= 3
+        depth = np.asarray(Image.open(io.BytesIO(row["observation.images.top_depth"]["bytes"])))
+        np.testing.assert_array_equal(data["top_depth"][i], depth)
+    assert list(data["missing_top_depth"][:]) == [r["missing.top_depth"] for r in rows]
+    said = root.attrs["depthrig"]
+    assert said["vectors"][0]["names"] == ["arm/gripper.opening", *(f"arm/joint_position.{j}" for j in JOINTS)]
+    assert [e["success"] for e in said["episodes"]] == [True, False, True]
+    assert said["streams"][1]["depth_unit_m"] == 0.001
 
 
 def test_lerobot_trains_on_it(binary: str, runtime: Path, recovered: Path, tmp_path: Path) -> None:  # noqa: F811

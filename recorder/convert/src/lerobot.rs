@@ -6,11 +6,11 @@
 //!
 //! `docs/exchange.md` says what LeRobot cannot hold and what becomes of it.
 
-mod encode;
+pub(crate) mod encode;
 mod finish;
 mod part;
-mod plan;
-mod schema;
+pub(crate) mod plan;
+pub(crate) mod schema;
 mod stats;
 mod table;
 
@@ -84,7 +84,7 @@ impl Exporter for Lerobot {
 
     fn plan(&mut self, sources: &[Source]) -> Result<Plan> {
         let plan = plan::Plan::make(sources, &self.options)?;
-        let losses = plan.losses.clone();
+        let losses = [plan.schema.losses(), plan.losses.clone()].concat();
         self.plan = Some(plan);
         let folders = ["data", "meta", "meta/episodes", "meta/episodes/chunk-000"].map(str::to_owned);
         Ok(Plan { folders: folders.into(), losses, ..Plan::by_segment(sources) })

@@ -30,14 +30,17 @@ pub mod scenes;
 mod source;
 pub mod store;
 mod vectors;
+mod zarr;
 pub mod zed_replay;
 
 pub use bytecamera::{ByteCameraExport, ByteCameraImport, ByteCameraOptions, CameraNames};
 pub use export::{ExportOptions, ExportProgress, Exporter, PartOut, PartSets, Parts, Plan, export};
 pub use folder::{OutFile, Output};
 pub use import::{ImportFacts, ImportProgress, ImportReport, Importer, import};
+pub use lerobot::LerobotOptions;
 pub use report::{DatasetIdentity, ExportReport, PartRecord, REPORT_FILE, SegmentIdentity, StreamCount};
 pub use rosbag::RosbagImport;
 pub use run_part::RunPart;
 pub use source::{EpisodeUse, PART_SETS, Part, Source};
 pub use vectors::{Gaps, VectorOptions};
+pub use zarr::Zarr;

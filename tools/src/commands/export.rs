@@ -8,7 +8,8 @@ use crate::progress::Progress;
 use crate::signals::Stop;
 use anyhow::Result;
 use core::ops::ControlFlow;
-use depthrig_convert::{ExportOptions, ExportReport, Exporter, export};
+use depthrig_convert::lerobot::Lerobot;
+use depthrig_convert::{ExportOptions, ExportReport, Exporter, Zarr, export};
 use depthrig_recorder::fs::RealFs;
 use depthrig_recorder::{Dataset, ErrorKind, Mark};
 use std::path::PathBuf;
@@ -31,6 +32,15 @@ Examples:
   depthrig export lerobot data/20261121_1015_kitchen lerobot/kitchen
   depthrig export lerobot data/* lerobot/all --task \"put the cup on the shelf\"";
 
+/// Examples for `--help` of `export zarr`.
+const ZARR_EXAMPLES: &str = "\
+Rows, episodes and values are those of depthrig export lerobot, with the same options. Images are exact; a missing one is zeros, and
+true in missing_CAMERA_STREAM.
+
+Examples:
+  depthrig export zarr data/20261121_1015_kitchen kitchen.zarr
+  depthrig export zarr data/2026* all.zarr --state arm/joint_position --action policy/action";
+
 /// Layouts to export to.
 #[derive(Debug, clap::Subcommand)]
 pub enum ExportCommand {
@@ -40,6 +50,9 @@ pub enum ExportCommand {
     /// Export to LeRobot v3.0: an episode per episode, or per dataset without any; JPEG/PNG colour, TIFF depth
     #[command(after_help = lerobot::EXAMPLES)]
     Lerobot(lerobot::Args),
+    /// Export to Zarr in the layout of diffusion_policy's replay buffer: an array per stream, state and action
+    #[command(after_help = ZARR_EXAMPLES)]
+    Zarr(lerobot::Args),
 }
 
 /// Options of every export.
@@ -69,8 +82,12 @@ pub fn run(command: &ExportCommand, context: &Context) -> Result<Exit> {
             drive(&mut exporter, common, context)
         }
         ExportCommand::Lerobot(args) => {
-            let (mut exporter, common) = args.exporter();
-            drive(&mut exporter, common, context)
+            let (options, common) = args.options();
+            drive(&mut Lerobot::new(options), common, context)
+        }
+        ExportCommand::Zarr(args) => {
+            let (options, common) = args.options();
+            drive(&mut Zarr::new(options), common, context)
         }
     }
 }

@@ -10,7 +10,7 @@ use tiff::encoder::{TiffEncoder, colortype};
 
 /// File format of a stream's images in the export.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Form {
+pub(crate) enum Form {
     /// The JPEG that is stored, or a PNG of what is stored losslessly: red, green, blue.
     Color,
     /// PNG of 8 bits.
@@ -25,7 +25,7 @@ pub(super) enum Form {
 
 impl Form {
     /// The form for a pixel format; `None` when LeRobot has none.
-    pub(super) const fn of(format: PixelFormat) -> Option<Self> {
+    pub(crate) const fn of(format: PixelFormat) -> Option<Self> {
         Some(match (format.layout(), format.sample(), format.is_depth()) {
             (Layout::Rgb | Layout::Bgr | Layout::Jpeg, ..) => Self::Color,
             (Layout::Grey, Sample::U8, false) => Self::Grey8,
@@ -37,7 +37,7 @@ impl Form {
     }
 
     /// Colour channels of an image.
-    pub(super) const fn channels(self) -> usize {
+    pub(crate) const fn channels(self) -> usize {
         match self {
             Self::Color => 3,
             _ => 1,
@@ -45,7 +45,7 @@ impl Form {
     }
 
     /// Whether it is depth.
-    pub(super) const fn is_depth(self) -> bool {
+    pub(crate) const fn is_depth(self) -> bool {
         matches!(self, Self::Depth16 | Self::DepthF32)
     }
 }
@@ -70,12 +70,35 @@ pub(super) fn encode(form: Form, frame: &DatasetFrame, sample: bool) -> Result<(
         let pixels = if sample { Some(jpeg_pixels(&frame.pixels, h)?) } else { None };
         return Ok((image, pixels.map(|p| thinned(form, h, PixelFormat::Rgb8, &p))));
     }
-    let format = h.pixel_format().filter(|f| Form::of(*f) == Some(form));
-    let format = format.ok_or_else(|| wrong(h, "has another pixel format than its session says"))?;
+    let format = format_of(form, h)?;
     let decoded = frame.decoded()?;
     let pixels = still::tight(h, &decoded, format);
     let image = lossless(form, h, format, &pixels)?;
     Ok((image, sample.then(|| thinned(form, h, format, &pixels))))
+}
+
+/// The pixels of a frame that was read as it is stored, without padding; colour as red, green, blue.
+pub(crate) fn pixels(form: Form, frame: &DatasetFrame) -> Result<Vec<u8>> {
+    let h = &frame.header;
+    if form == Form::Color && matches!(frame.codec, "jpeg" | "mjpeg") {
+        return jpeg_pixels(&frame.pixels, h);
+    }
+    let format = format_of(form, h)?;
+    let decoded = frame.decoded()?;
+    let mut pixels = still::tight(h, &decoded, format).into_owned();
+    if pixels.len() != format.frame_bytes(h.width, h.height) {
+        return Err(wrong(h, format_args!("has {} bytes, not as many as its size says", pixels.len())));
+    }
+    if format == PixelFormat::Bgr8 {
+        pixels.as_chunks_mut::<3>().0.iter_mut().for_each(|p| p.swap(0, 2));
+    }
+    Ok(pixels)
+}
+
+/// The pixel format of a frame, which its form must be for.
+fn format_of(form: Form, h: &FrameHeader) -> Result<PixelFormat> {
+    let format = h.pixel_format().filter(|f| Form::of(*f) == Some(form));
+    format.ok_or_else(|| wrong(h, "has another pixel format than its session says"))
 }
 
 /// An image of zeros: black, no depth. It stands where a camera delivered nothing.

@@ -11,35 +11,35 @@ use std::collections::BTreeMap;
 
 /// Everything that is decided before an image is read.
 #[derive(Debug, Clone)]
-pub(super) struct Plan {
-    pub(super) schema: Schema,
-    pub(super) fps: f64,
-    pub(super) episodes: Vec<Episode>,
+pub(crate) struct Plan {
+    pub(crate) schema: Schema,
+    pub(crate) fps: f64,
+    pub(crate) episodes: Vec<Episode>,
     /// The tasks in the order of their indices.
-    pub(super) tasks: Vec<String>,
+    pub(crate) tasks: Vec<String>,
     /// Changes and omissions by the format, in words.
-    pub(super) losses: Vec<String>,
+    pub(crate) losses: Vec<String>,
 }
 
 /// A dataset, or one of its episodes, as an episode of LeRobot.
 #[derive(Debug, Clone)]
-pub(super) struct Episode {
-    pub(super) task: usize,
-    pub(super) first_row: u64,
-    pub(super) rows: u64,
+pub(crate) struct Episode {
+    pub(crate) task: usize,
+    pub(crate) first_row: u64,
+    pub(crate) rows: u64,
     /// Number of its first set.
     first: usize,
     /// Numbers of its sets that are left out, in order.
     left_out: Vec<usize>,
     /// State and action at its sets.
-    pub(super) moments: Moments,
+    pub(crate) moments: Moments,
     /// Somebody judged that its task was done.
-    pub(super) is_success: bool,
+    pub(crate) is_success: bool,
 }
 
 impl Episode {
     /// The row within the episode of the set with this number; `None` when it is left out.
-    pub(super) fn row_of(&self, number: usize) -> Option<u64> {
+    pub(crate) fn row_of(&self, number: usize) -> Option<u64> {
         match self.left_out.binary_search(&number) {
             Ok(_) => None,
             Err(before) => Some((number - self.first - before) as u64),
@@ -109,7 +109,7 @@ fn incomplete(source: &Source, schema: &Schema) -> Result<Vec<usize>> {
 
 impl Plan {
     /// Decides how `sources` are exported; reads sets, without images, only where incomplete ones are left out.
-    pub(super) fn make(sources: &[Source], options: &LerobotOptions) -> Result<Self> {
+    pub(crate) fn make(sources: &[Source], options: &LerobotOptions) -> Result<Self> {
         let bad = |message: String| Error::new(ErrorKind::BadInput, message);
         let wanted = |id: &StreamId| options.streams.is_empty() || options.streams.contains(id);
         for id in &options.streams {
@@ -118,7 +118,7 @@ impl Plan {
             }
         }
         let schema = Schema::of(sources, &wanted, &options.signals)?;
-        let losses = schema.losses();
+        let losses = schema.vector_losses();
         let mut plan = Self { schema, fps: 0.0, episodes: Vec::new(), tasks: Vec::new(), losses };
         let mut fps = None;
         let mut first_row = 0;
@@ -182,7 +182,7 @@ impl Plan {
     }
 
     /// Rows of all episodes.
-    pub(super) fn rows(&self) -> u64 {
+    pub(crate) fn rows(&self) -> u64 {
         self.episodes.iter().map(|e| e.rows).sum()
     }
 }

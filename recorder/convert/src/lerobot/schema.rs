@@ -26,13 +26,13 @@ const PER_SET: [(&str, Kind); 3] =
 
 /// One stream as a feature.
 #[derive(Debug, Clone)]
-pub(super) struct Feature {
-    pub(super) id: StreamId,
-    pub(super) form: Form,
-    pub(super) width: u32,
-    pub(super) height: u32,
+pub(crate) struct Feature {
+    pub(crate) id: StreamId,
+    pub(crate) form: Form,
+    pub(crate) width: u32,
+    pub(crate) height: u32,
     /// `camera_stream`.
-    short: String,
+    pub(crate) short: String,
     /// Its facts in `info.json` besides type and shape.
     info: Value,
 }
@@ -67,10 +67,10 @@ impl Feature {
 
 /// The features of an export.
 #[derive(Debug, Clone)]
-pub(super) struct Schema {
-    pub(super) features: Vec<Feature>,
+pub(crate) struct Schema {
+    pub(crate) features: Vec<Feature>,
     /// The robot's state and action, as far as there are signals for them.
-    pub(super) vectors: Vec<Vector>,
+    pub(crate) vectors: Vec<Vector>,
     options: VectorOptions,
     /// Some episode was judged.
     is_judged: bool,
@@ -123,7 +123,7 @@ impl Schema {
     }
 
     /// For each stream of a dataset its feature, if it is exported.
-    pub(super) fn places(&self, source: &Source) -> Vec<Option<usize>> {
+    pub(crate) fn places(&self, source: &Source) -> Vec<Option<usize>> {
         let streams = source.session().streams.iter();
         streams.map(|s| self.features.iter().position(|f| f.id == s.id)).collect()
     }
@@ -144,6 +144,12 @@ impl Schema {
                 f.key()
             ));
         }
+        losses
+    }
+
+    /// The same of state and action, for every layout that has them.
+    pub(crate) fn vector_losses(&self) -> Vec<String> {
+        let mut losses = Vec::new();
         for v in &self.vectors {
             losses.push(format!("{}: {}", v.key, self.rule()));
             let has_text = |s: &&SignalRecord| s.description.has_text();
@@ -153,7 +159,7 @@ impl Schema {
     }
 
     /// How the values of signals at a set come about, in words.
-    fn rule(&self) -> String {
+    pub(crate) fn rule(&self) -> String {
         let max_gap_s = self.options.max_gap_ns as f64 / 1e9;
         let gaps = match self.options.gaps {
             Gaps::Refuse => "",
@@ -294,7 +300,7 @@ fn lerobot_unit(s: &StreamRecord) -> Option<&'static str> {
 }
 
 /// Serial number, intrinsics, pose and where they come from.
-pub(super) fn calibration(s: &StreamRecord) -> [(&'static str, Value); 4] {
+pub(crate) fn calibration(s: &StreamRecord) -> [(&'static str, Value); 4] {
     let i = &s.intrinsics;
     let intrinsics = i.is_known().then(|| {
         json!({

@@ -3,7 +3,7 @@
 use super::Common;
 use clap::ValueEnum;
 use depthrig_bus::StreamId;
-use depthrig_convert::lerobot::{Incomplete, Lerobot, LerobotOptions};
+use depthrig_convert::lerobot::{Incomplete, LerobotOptions};
 use depthrig_convert::{Gaps, VectorOptions};
 
 /// Examples for `--help`.
@@ -34,10 +34,10 @@ pub struct Args {
     /// Export only this stream; repeatable
     #[arg(long = "stream", value_name = "CAMERA/STREAM")]
     streams: Vec<StreamId>,
-    /// Put this signal into observation.state; repeatable [default: all but actions]
+    /// Put this signal into the state; repeatable [default: all but actions]
     #[arg(long, value_name = "DEVICE/SIGNAL")]
     state: Vec<StreamId>,
-    /// Put this signal into action; repeatable [default: those named action or action_…]
+    /// Put this signal into the action; repeatable [default: those named action or action_…]
     #[arg(long, value_name = "DEVICE/SIGNAL")]
     action: Vec<StreamId>,
     /// Longest distance of two samples to interpolate between
@@ -67,8 +67,8 @@ enum HowIncomplete {
 }
 
 impl Args {
-    /// Builds the exporter, and returns it with the common options.
-    pub fn exporter(&self) -> (Lerobot, &Common) {
+    /// The options of the exporter, and the common ones.
+    pub fn options(&self) -> (LerobotOptions, &Common) {
         let options = LerobotOptions {
             task: self.task.clone(),
             fps: self.fps,
@@ -87,6 +87,6 @@ impl Args {
                 },
             },
         };
-        (Lerobot::new(options), &self.common)
+        (options, &self.common)
     }
 }

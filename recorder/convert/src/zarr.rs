@@ -1,0 +1,253 @@
+//! Zarr (version 2) in the layout of `diffusion_policy`'s replay buffer: below `data` an array for each stream and vector, the rows of
+//! all episodes one after the other, and `meta/episode_ends`. The rows are those of the export to LeRobot.
+//!
+//! A chunk of an image array is one image, so that parts write chunks of their own; a missing image has no chunk and reads as zeros.
+
+use crate::lerobot::encode::{Form, pixels};
+use crate::lerobot::plan;
+use crate::lerobot::schema::{Feature, calibration};
+use crate::{EpisodeUse, Exporter, LerobotOptions, Output, Part, PartOut, PartSets, Parts, Plan, Source};
+use depthrig_bus::StreamId;
+use depthrig_recorder::{Error, ErrorKind, PixelMode, Result};
+use serde_json::{Value, json};
+
+/// The level of zstd: the fastest, which packs depth nearly as well as the next ones.
+const LEVEL: i32 = 1;
+
+/// The exporter to Zarr.
+#[derive(Debug, Default)]
+pub struct Zarr {
+    options: LerobotOptions,
+    plan: Option<plan::Plan>,
+}
+
+impl Zarr {
+    /// With these options.
+    pub const fn new(options: LerobotOptions) -> Self {
+        Self { options, plan: None }
+    }
+
+    fn planned(&self) -> Result<&plan::Plan> {
+        let missing = || Error::new(ErrorKind::BadInput, "an export must be planned before it is worked on");
+        self.plan.as_ref().ok_or_else(missing)
+    }
+}
+
+impl Exporter for Zarr {
+    fn format(&self) -> &'static str {
+        "zarr"
+    }
+
+    fn episodes(&self) -> EpisodeUse {
+        EpisodeUse::Each
+    }
+
+    fn takes(&self, signal: &StreamId) -> bool {
+        self.plan.iter().flat_map(|p| &p.schema.vectors).any(|v| v.signals().any(|s| s.id == *signal))
+    }
+
+    fn options(&self) -> Value {
+        json!(self.options)
+    }
+
+    fn plan(&mut self, sources: &[Source]) -> Result<Plan> {
+        let plan = plan::Plan::make(sources, &self.options)?;
+        let mut losses = plan.losses.clone();
+        losses.push("a missing image reads as zeros, and is true in missing_CAMERA_STREAM".to_owned());
+        let arrays = names(&plan).into_iter().map(|name| format!("data/{name}"));
+        let folders =
+            ["data".to_owned(), "meta".to_owned(), ENDS.to_owned()].into_iter().chain(arrays).collect();
+        self.plan = Some(plan);
+        Ok(Plan { folders, losses, ..Plan::by_segment(sources) })
+    }
+
+    fn part(
+        &self,
+        source: &Source,
+        part: &Part,
+        sets: &mut PartSets<'_>,
+        out: &mut PartOut<'_>,
+    ) -> Result<()> {
+        let plan = self.planned()?;
+        let episode = &plan.episodes[part.source];
+        let places = plan.schema.places(source);
+        let mut present = Vec::new();
+        while let Some((number, set)) = sets.next(PixelMode::Stored, out)? {
+            let Some(row) = episode.row_of(number) else {
+                out.leave_out();
+                continue;
+            };
+            let row = episode.first_row + row;
+            for frame in &set.frames {
+                let Some(place) = places.get(frame.stream).copied().flatten() else { continue };
+                let feature = &plan.schema.features[place];
+                match pixels(feature.form, frame) {
+                    Ok(bytes) => {
+                        let name = format!("data/{}/{row}{}", feature.short, inner_chunks(feature.form));
+                        out.file(&name, &packed(&bytes)?)?;
+                        out.frame(frame.stream);
+                        present.push((row, place));
+                    }
+                    Err(e) => out.lose(e.to_string()),
+                }
+            }
+        }
+        *out.rows() = serde_json::to_vec(&present).map_err(unwritten)?;
+        Ok(())
+    }
+
+    fn finish(&self, sources: &[Source], parts: &Parts<'_>, out: &Output<'_>) -> Result<()> {
+        let plan = self.planned()?;
+        let rows = plan.rows() as usize;
+        let mut missing = vec![vec![1_u8; rows]; plan.schema.features.len()];
+        for source in 0..sources.len() {
+            for part in parts.rows(source) {
+                let present: Vec<(usize, usize)> = serde_json::from_slice(&part?).map_err(unread)?;
+                for (row, place) in present {
+                    if let Some(cell) = missing.get_mut(place).and_then(|m| m.get_mut(row)) {
+                        *cell = 0;
+                    }
+                }
+            }
+        }
+        for (feature, missing) in plan.schema.features.iter().zip(&missing) {
+            let head = image_head(feature, rows);
+            write_json(out, &format!("data/{}/.zarray", feature.short), &head)?;
+            array(out, &format!("data/missing_{}", feature.short), "|b1", &[rows], missing)?;
+        }
+        let mut times = Vec::with_capacity(rows);
+        let mut vectors: Vec<Vec<u8>> = vec![Vec::new(); plan.schema.vectors.len()];
+        let mut masks: Vec<Vec<u8>> = vec![Vec::new(); plan.schema.vectors.len()];
+        for (source, episode) in sources.iter().zip(&plan.episodes) {
+            for number in source.numbers().filter(|n| episode.row_of(*n).is_some()) {
+                times.push(source.times()[number]);
+                for (v, (values, mask)) in vectors.iter_mut().zip(&mut masks).enumerate() {
+                    let row = episode.moments.row(v, number);
+                    values.extend(row.into_iter().flat_map(|r| &r.values).flat_map(|x| x.to_le_bytes()));
+                    mask.push(u8::from(row.is_none_or(|r| r.is_missing)));
+                }
+            }
+        }
+        array(out, "data/utc_ns", "<i8", &[rows], &bytes_of(&times))?;
+        for ((vector, values), mask) in plan.schema.vectors.iter().zip(&vectors).zip(&masks) {
+            let name = short_of(vector.key);
+            array(out, &format!("data/{name}"), "<f4", &[rows, vector.names().len()], values)?;
+            array(out, &format!("data/missing_{name}"), "|b1", &[rows], mask)?;
+        }
+        let ends: Vec<_> = plan.episodes.iter().map(|e| (e.first_row + e.rows) as i64).collect();
+        array(out, ENDS, "<i8", &[ends.len()], &bytes_of(&ends))?;
+        for group in ["data/", "meta/", ""] {
+            write_json(out, &format!("{group}.zgroup"), &json!({ "zarr_format": 2 }))?;
+        }
+        write_json(out, ".zattrs", &attributes(plan, sources))
+    }
+}
+
+const ENDS: &str = "meta/episode_ends";
+
+/// The arrays below `data`.
+fn names(plan: &plan::Plan) -> Vec<String> {
+    let streams = plan.schema.features.iter().map(|f| f.short.clone());
+    let vectors = plan.schema.vectors.iter().map(|v| short_of(v.key).to_owned());
+    let both: Vec<_> = streams.chain(vectors).collect();
+    let missing: Vec<_> = both.iter().map(|name| format!("missing_{name}")).collect();
+    [both, missing, vec!["utc_ns".to_owned()]].concat()
+}
+
+/// LeRobot's `observation.state` is `state` here.
+fn short_of(key: &str) -> &str {
+    key.rsplit('.').next().unwrap_or(key)
+}
+
+/// The chunk's numbers behind that of the row.
+const fn inner_chunks(form: Form) -> &'static str {
+    if form.channels() == 1 { ".0.0" } else { ".0.0.0" }
+}
+
+fn image_head(feature: &Feature, rows: usize) -> Value {
+    let kind = match feature.form {
+        Form::Color | Form::Grey8 => "|u1",
+        Form::Grey16 | Form::Depth16 => "<u2",
+        Form::DepthF32 => "<f4",
+    };
+    let mut image = vec![feature.height as usize, feature.width as usize];
+    if feature.form.channels() > 1 {
+        image.push(feature.form.channels());
+    }
+    let of = |n: usize| core::iter::once(n).chain(image.iter().copied()).collect::<Vec<_>>();
+    head(kind, &of(rows), &of(1))
+}
+
+/// The `.zarray` of an array.
+fn head(kind: &str, shape: &[usize], chunks: &[usize]) -> Value {
+    json!({
+        "zarr_format": 2,
+        "shape": shape,
+        "chunks": chunks,
+        "dtype": kind,
+        "compressor": { "id": "zstd", "level": LEVEL },
+        "fill_value": if kind == "|b1" { json!(false) } else { json!(0) },
+        "order": "C",
+        "filters": null,
+    })
+}
+
+/// Writes an array of one chunk.
+fn array(out: &Output<'_>, name: &str, kind: &str, shape: &[usize], bytes: &[u8]) -> Result<()> {
+    let chunk: Vec<_> = shape.iter().map(|n| (*n).max(1)).collect();
+    write_json(out, &format!("{name}/.zarray"), &head(kind, shape, &chunk))?;
+    let first = vec!["0"; shape.len()].join(".");
+    out.file(&format!("{name}/{first}"), &packed(bytes)?)
+}
+
+/// Facts of streams, vectors and episodes that the arrays have no place for.
+fn attributes(plan: &plan::Plan, sources: &[Source]) -> Value {
+    let streams = plan.schema.features.iter().filter_map(|feature| {
+        let mut entry = json!({ "array": feature.short, "stream": feature.id.to_string() });
+        let record = sources.first()?.session().streams.iter().find(|s| s.id == feature.id)?;
+        entry["depth_unit_m"] = json!(record.depth_unit_m);
+        for (key, value) in calibration(record) {
+            entry[key] = value;
+        }
+        Some(entry)
+    });
+    let vectors = plan.schema.vectors.iter().map(|v| json!({ "array": short_of(v.key), "names": v.names() }));
+    let episodes = sources.iter().zip(&plan.episodes).map(|(source, e)| {
+        json!({
+            "session": source.session().name,
+            "task": plan.tasks[e.task],
+            "success": e.is_success,
+            "episode": source.episode(),
+        })
+    });
+    json!({ "depthrig": {
+        "format": "depthrig.zarr/1",
+        "rate_hz": plan.fps,
+        "streams": streams.collect::<Vec<_>>(),
+        "vectors": vectors.collect::<Vec<_>>(),
+        "interpolation": plan.schema.rule(),
+        "episodes": episodes.collect::<Vec<_>>(),
+    } })
+}
+
+fn bytes_of(numbers: &[i64]) -> Vec<u8> {
+    numbers.iter().flat_map(|n| n.to_le_bytes()).collect()
+}
+
+fn packed(bytes: &[u8]) -> Result<Vec<u8>> {
+    let failed = |e| Error::new(ErrorKind::Codec, "a chunk cannot be packed").with_source(e);
+    zstd::bulk::compress(bytes, LEVEL).map_err(failed)
+}
+
+fn write_json(out: &Output<'_>, name: &str, value: &Value) -> Result<()> {
+    out.file(name, &serde_json::to_vec_pretty(value).map_err(unwritten)?)
+}
+
+fn unwritten(e: serde_json::Error) -> Error {
+    Error::new(ErrorKind::BadInput, "the description of an array cannot be written").with_source(e)
+}
+
+fn unread(e: serde_json::Error) -> Error {
+    let what = "the marks of a part are not as depthrig wrote them; export into a new folder";
+    Error::new(ErrorKind::Corrupt, what).with_source(e)
+}
