@@ -6,7 +6,8 @@ use depthrig_daemon::control::{
 };
 use depthrig_daemon::status::{
     CameraState, CameraStatus, ClockStatus, PreparingStatus, RecordingStatus, RefineState, RefineStatus,
-    ReplayStatus, RigStatus, SetAccount, SetStatus, SharedMemoryStatus, StreamStatus,
+    ReplayStatus, RigStatus, SetAccount, SetStatus, SharedMemoryStatus, SignalState, SignalStatus,
+    StreamStatus,
 };
 use depthrig_daemon::{Error, ErrorKind, Result};
 use depthrig_recorder::Episode;
@@ -146,7 +147,14 @@ impl Fake {
             uptime_s: 12.5,
             utc_ns: 1_700_000_000_123_456_789,
             preparing: Some(PreparingStatus { images: 3, images_total: 12, share: 0.25, error: None }),
-            signals: Vec::new(),
+            signals: vec![SignalStatus {
+                signal: "arm/joint_position".into(),
+                required: true,
+                state: SignalState::Silent,
+                age_s: Some(1.5),
+                samples: 3000,
+                missed: 2,
+            }],
             cameras: vec![
                 camera("d435", CameraState::Streaming, None),
                 camera("d405", CameraState::Reconnecting, Some("unplugged")),

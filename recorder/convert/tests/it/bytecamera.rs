@@ -19,8 +19,9 @@ use std::sync::Arc;
 /// Every kind of stream, two cameras of one model, and two infrared images of one camera.
 fn everything() -> Session {
     let mut s = session();
-    // The layout has no place for it, which is said: `an_export_says_that_it_leaves_out_motion`.
+    // The layout has no place for them, which is said: `an_export_says_that_it_leaves_out_what_is_no_image`.
     s.motion.clear();
+    s.signals.clear();
     s.name = "20260314_1512_kitchen".into();
     s.streams = vec![
         stream("front/color", PixelFormat::Rgb8, 32, 24),
