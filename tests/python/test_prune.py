@@ -47,8 +47,9 @@ def hashes(folder: Path) -> dict[str, str]:
 
 def exported(binary: str, runtime: Path, dataset: Path, out: Path) -> tuple[dict[str, str], dict[str, list[str]]]:  # noqa: F811
     """The files of LeRobot, and the images of ByteCameraDepth by stream in their order: they are named by their number in the dataset."""
-    for kind in ("lerobot", "bytecameradepth"):
-        command(binary, runtime, "export", kind, str(dataset), str(out / kind), codes=CODES)
+    # A busy computer lets a publisher wait: gaps of signals are not what this is about.
+    for kind, options in [("lerobot", ("--max-gap", "1m")), ("bytecameradepth", ())]:
+        command(binary, runtime, "export", kind, str(dataset), str(out / kind), *options, codes=CODES)
     images: dict[str, list[str]] = {}
     for file in sorted((out / "bytecameradepth").rglob("*.png"), key=lambda f: int(f.stem.rpartition("_")[2])):
         images.setdefault(file.stem.rpartition("_")[0], []).append(hashlib.sha256(file.read_bytes()).hexdigest())

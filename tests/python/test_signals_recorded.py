@@ -458,6 +458,13 @@ def test_a_killed_recorder_loses_a_second_at_most(binary: str, runtime: Path, ri
     check_all(Recorded(dataset, robot.sent), "arm/joint_position", [(t - offset, v) for t, v in got])
 
 
+def wait_for_line(log: Path, text: str) -> None:
+    deadline = time.monotonic() + WAIT_S
+    while text not in log.read_text():
+        assert time.monotonic() < deadline, log.read_text()
+        time.sleep(0.05)
+
+
 def test_a_required_signal_must_come_before_a_recording_begins(
     binary: str,  # noqa: F811
     runtime: Path,  # noqa: F811
@@ -493,11 +500,11 @@ def test_a_required_signal_must_come_before_a_recording_begins(
             os.kill(process.pid, signals.SIGSTOP)
             silent = the_signal(3)
             assert silent["state"] == "silent" and silent["age_s"] > 0.5
+            wait_for_line(log, "signal late/joints, which this rig requires, has been silent for")
             os.kill(process.pid, signals.SIGCONT)
             assert the_signal(0)["state"] == "live"
+            wait_for_line(log, "signal late/joints comes again")
             command(binary, runtime, "record", "stop", codes=(0, 3))
-    said = log.read_text()
-    assert "has been silent for" in said and "signal late/joints comes again" in said
     assert len(list(decoded(dataset))) > 0
 
     # `run --record` waits for it.

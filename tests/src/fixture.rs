@@ -32,6 +32,8 @@ pub struct Fixture {
     pub sets: u64,
     /// Sets, from 0, that were not recorded.
     pub lost: Vec<u64>,
+    /// Sets, from 0, that have no colour.
+    pub without_color: Vec<u64>,
     /// How far the frames of a set may be apart, nanoseconds; they are, by a millisecond from stream to stream.
     pub max_spread_ns: Option<i64>,
     /// Pixels per row and rows.
@@ -54,6 +56,7 @@ impl Default for Fixture {
             period_ns: SECOND / 5,
             sets: 12,
             lost: Vec::new(),
+            without_color: Vec::new(),
             max_spread_ns: None,
             size: (64, 48),
             color: ColorCodec::Raw,
@@ -190,7 +193,10 @@ impl Fixture {
             header: self.header(s, i, n),
             pixels: Box::new(pixels(s.format, s.width, s.height, n + 31 * i as u64)),
         };
-        let frames: Vec<_> = session.streams.iter().enumerate().map(frame).collect();
+        let is_missing = |s: &StreamRecord| s.format == PixelFormat::Rgb8 && self.without_color.contains(&n);
+        let (missing, present): (Vec<_>, Vec<_>) =
+            session.streams.iter().enumerate().partition(|(_, s)| is_missing(s));
+        let frames: Vec<_> = present.into_iter().map(frame).collect();
         let times = frames.iter().map(|f| f.header.capture_time_ns);
         RecordSet {
             id: 3 * n + 5,
@@ -199,7 +205,7 @@ impl Fixture {
             motion: self.batches(session, n),
             signals: Vec::new(),
             spread_ns: times.clone().max().unwrap_or(0) - times.min().unwrap_or(0),
-            missing: Vec::new(),
+            missing: missing.into_iter().map(|(i, _)| i).collect(),
             frames,
         }
     }

@@ -125,6 +125,20 @@ fn a_recording_that_lost_something_is_copied_with_its_gaps() {
     assert!(report.problems[0].contains("is the limit"), "{:?}", report.problems);
 }
 
+/// Also where it is the first one, with which the file of refined images begins.
+#[test]
+fn a_set_that_lacks_an_image_has_no_refined_one_and_the_next_one_has() {
+    let dir = tempfile::tempdir().unwrap();
+    let source = dir.path().join("source");
+    let out = dir.path().join("out");
+    Fixture { sets: 9, without_color: vec![0, 4], ..Fixture::default() }.record(&source);
+    let report = relabel(&Dataset::open(&source).unwrap(), &out, &options(2), &mut go_on).unwrap();
+    assert_eq!((report.sets, report.lost), (9, 0), "{:?}", report.problems);
+    let ids: Vec<_> = refined(&out).into_iter().map(|(id, ..)| id).collect();
+    let expected: Vec<_> = [1, 2, 3, 5, 6, 7, 8].iter().flat_map(|n| [3 * n + 5; 2]).collect();
+    assert_eq!(ids, expected);
+}
+
 #[test]
 fn a_run_that_was_ended_goes_on() {
     let dir = tempfile::tempdir().unwrap();

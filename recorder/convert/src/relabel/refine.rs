@@ -189,14 +189,16 @@ impl Store {
         Self { dir: dir.to_owned(), images: BTreeMap::new() }
     }
 
-    /// The packed image of a set and a camera; `None` when the file has no such image.
-    pub(super) fn take(&mut self, number: usize, camera: usize) -> Result<Option<Vec<u8>>> {
-        self.begin(number)?;
-        Ok(self.images.remove(&(number, camera)))
+    /// The packed image of a set and a camera; `None` when there is no such image.
+    pub(super) fn take(&mut self, number: usize, camera: usize) -> Option<Vec<u8>> {
+        self.images.remove(&(number, camera))
     }
 
-    /// Reads the file that begins with this set, if one does.
-    fn begin(&mut self, number: usize) -> Result<()> {
+    /// Reads the file that begins with this set, if one does. To be called for each set, also for one that lacks an image.
+    ///
+    /// # Errors
+    /// As the disk says, and when the file is damaged.
+    pub(super) fn begin(&mut self, number: usize) -> Result<()> {
         let path = self.dir.join(file_name(number));
         if self.images.keys().next().is_some_and(|(first, _)| *first >= number) {
             return Ok(());

@@ -119,7 +119,7 @@ impl<'a> Write<'a> {
     fn refined(&mut self, number: usize, set: &DatasetSet, at: usize) -> Result<Option<RecordFrame>> {
         let camera = &self.cameras[at];
         let Some((color, depth)) = pair(set, camera) else { return Ok(None) };
-        let Some(packed) = self.store.take(number, at)? else {
+        let Some(packed) = self.store.take(number, at) else {
             let what =
                 format!("{} of set {} is not there although it was refined; begin anew", camera.id, set.id);
             return Err(Error::new(ErrorKind::Corrupt, what));
@@ -162,6 +162,7 @@ impl Importer for Write<'_> {
         while self.number < self.reader.times().len() {
             let number = self.number;
             self.number += 1;
+            self.store.begin(number)?;
             let set = match self.reader.read(number, PixelMode::DecodedAndStored) {
                 Ok(set) => set,
                 Err(e) if e.kind() == ErrorKind::Io => return Err(e),
