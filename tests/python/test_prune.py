@@ -8,7 +8,10 @@ import random
 import shutil
 import signal
 import subprocess
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import depthrig
@@ -21,18 +24,35 @@ __all__ = ["binary", "runtime"]
 RIG = ("--rig", "prune")
 
 
+@contextmanager
+def publishing(runtime: Path) -> Iterator[None]:  # noqa: F811
+    """A robot's process."""
+    stop = threading.Event()
+
+    def run() -> None:
+        with depthrig.Signal("arm/joints", fields=["a", "b"], unit="rad", kind="joints", runtime_dir=runtime) as arm:
+            number = 0
+            while not stop.wait(0.02):
+                arm.publish([number, number / 10])
+                number += 1
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
 @pytest.fixture(scope="module")
 def dataset(binary: str, runtime: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: F811
     """Four episodes, of which the first and the third are discarded, with a signal beside them."""
     folder = tmp_path_factory.mktemp("prune")
-    arm = depthrig.Signal("arm/joints", fields=["a", "b"], unit="rad", kind="joints", runtime_dir=runtime)
-    with rig_runs(binary, runtime, folder, "prune"):
+    with publishing(runtime), rig_runs(binary, runtime, folder, "prune"):
         command(binary, runtime, "record", "start", "--name", "cups", *RIG)
-        for number, end in enumerate((["discard"], ["stop", "success"], ["discard"], ["stop"]), 1):
+        for end in (["discard"], ["stop", "success"], ["discard"], ["stop"]):
             command(binary, runtime, "episode", "start", "--task", "put the cup away", *RIG)
-            for k in range(20):
-                arm.publish([number, k / 10])
-                time.sleep(0.02)
             record_sets(binary, runtime, "prune")
             command(binary, runtime, "episode", *end, *RIG)
             record_sets(binary, runtime, "prune")

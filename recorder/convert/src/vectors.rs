@@ -41,7 +41,8 @@ impl Default for VectorOptions {
 
 /// Samples come with the set after them, which was put together this much later at most, nanoseconds.
 const LATENCY_NS: i64 = 2_000_000_000;
-/// So much before the first or after the last sample of a signal is left out, and stated, nanoseconds.
+/// So much without a signal at either end of an episode or a dataset is left out, and stated, nanoseconds: its last set may lack the sample
+/// after it, which came with a set that was cut away or pruned.
 const EDGE_NS: i64 = 1_000_000_000;
 /// Moments that a message names.
 const NAMED: usize = 5;
@@ -149,7 +150,7 @@ pub(crate) struct Moments {
     numbers: Vec<usize>,
     /// By vector, by row.
     rows: Vec<Vec<Row>>,
-    /// Numbers of sets at the ends that lie outside of the samples, in order.
+    /// Numbers of sets at the ends without a value, in order.
     pub(crate) left_out: Vec<usize>,
 }
 
@@ -220,12 +221,11 @@ fn around(source: &Source, times: &[i64], options: &VectorOptions) -> Range<usiz
     begin..all.partition_point(|t| *t <= last.saturating_add(margin))
 }
 
-/// The rows at the beginning and at the end at which some signal has no sample yet, or none any more, as far as they are
-/// within [`EDGE_NS`].
+/// The rows at the beginning and at the end at which some signal has no value, as far as they are within [`EDGE_NS`].
 fn edges(tracks: &[Vec<Track>], times: &[i64]) -> impl Iterator<Item = usize> + use<> {
     let all = || tracks.iter().flatten();
-    let begin = all().map(|t| outside(t.rows.iter())).max().unwrap_or(0);
-    let end = all().map(|t| outside(t.rows.iter().rev())).max().unwrap_or(0);
+    let begin = all().map(|t| without(t.rows.iter())).max().unwrap_or(0);
+    let end = all().map(|t| without(t.rows.iter().rev())).max().unwrap_or(0);
     let n = times.len();
     let is_short = |rows: Range<usize>| {
         let span = times.get(rows.clone()).and_then(|t| Some(t.last()? - t.first()?)).unwrap_or(0);
@@ -236,16 +236,16 @@ fn edges(tracks: &[Vec<Track>], times: &[i64]) -> impl Iterator<Item = usize> + 
     (0..begin).chain((n - end).max(begin)..n)
 }
 
-/// How many of these rows lie outside of the samples before the first that does not.
-fn outside<'c>(rows: impl Iterator<Item = &'c Cell>) -> usize {
-    rows.take_while(|c| c.why == Some(Why::Outside)).count()
+/// How many of these rows have no value before the first that has one.
+fn without<'c>(rows: impl Iterator<Item = &'c Cell>) -> usize {
+    rows.take_while(|c| c.is_missing).count()
 }
 
 /// One row for each moment from the signals of a vector.
 fn join(tracks: &[Track], n: usize) -> Vec<Row> {
     let row = |i: usize| Row {
         values: tracks.iter().flat_map(|t| t.rows[i].values.iter().copied()).collect(),
-        is_missing: tracks.iter().any(|t| t.rows[i].why.is_some()),
+        is_missing: tracks.iter().any(|t| t.rows[i].is_missing),
     };
     (0..n).map(row).collect()
 }
@@ -257,23 +257,14 @@ struct Track {
     series: Series,
     /// The last value, 0 before the first.
     held: Vec<f32>,
-    is_begun: bool,
     rows: Vec<Cell>,
 }
 
 /// The values of a signal at one moment.
 struct Cell {
     values: Vec<f32>,
-    why: Option<Why>,
-}
-
-/// Why a signal has no value at a moment.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Why {
-    /// It is before its first sample, or after its last one.
-    Outside,
-    /// Its neighbours are too far apart, or of two publishers.
-    Gap,
+    /// It is outside of the samples, or its neighbours are too far apart or of two publishers.
+    is_missing: bool,
 }
 
 impl Track {
@@ -286,7 +277,6 @@ impl Track {
             max_gap,
             series: Series::new(max_gap),
             held: vec![0.0; n as usize],
-            is_begun: false,
             rows: Vec::with_capacity(rows),
         }
     }
@@ -306,11 +296,9 @@ impl Track {
             if let Some(at) = &at {
                 self.held = numbers(at);
             }
-            let why = if self.is_begun { Why::Gap } else { Why::Outside };
-            let cell = Cell { values: self.held.clone(), why: at.is_none().then_some(why) };
+            let cell = Cell { values: self.held.clone(), is_missing: at.is_none() };
             self.rows.push(cell);
         }
-        self.is_begun = true;
         self.held = newest;
         Ok(())
     }
@@ -318,7 +306,7 @@ impl Track {
     /// Fills the moments after the last sample.
     fn end(&mut self, n: usize) {
         while self.rows.len() < n {
-            self.rows.push(Cell { values: self.held.clone(), why: Some(Why::Outside) });
+            self.rows.push(Cell { values: self.held.clone(), is_missing: true });
         }
     }
 
@@ -328,7 +316,7 @@ impl Track {
             .rows
             .iter()
             .zip(&moments.numbers)
-            .filter(|(cell, number)| cell.why.is_some() && moments.left_out.binary_search(number).is_err())
+            .filter(|(cell, number)| cell.is_missing && moments.left_out.binary_search(number).is_err())
             .map(|(_, number)| *number)
             .collect();
         let (Some(first), Some(last)) = (missing.first(), missing.last()) else { return Ok(()) };

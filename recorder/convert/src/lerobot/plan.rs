@@ -137,7 +137,7 @@ impl Plan {
             if !moments.left_out.is_empty() {
                 let n = moments.left_out.len();
                 plan.losses.push(format!(
-                    "{session}: {n} sets before or after the samples of a signal are left out"
+                    "{session}: {n} sets at its ends without a value of each signal are left out"
                 ));
                 left_out.extend(&moments.left_out);
                 left_out.sort_unstable();
