@@ -1,4 +1,6 @@
 //! `session.toml`: who recorded what with which rig, and how it was calibrated.
+//!
+//! More than 500 lines, because the file is one table whose parts are checked against each other.
 
 use crate::fs::{self, Fs};
 use crate::{Error, ErrorKind, RecordMotion, Result, SET_MOTION_MAX_BYTES, SetCounts};

@@ -53,7 +53,8 @@ def dataset(binary: str, runtime: Path, tmp_path_factory: pytest.TempPathFactory
         command(binary, runtime, "record", "start", "--name", "cups", *RIG)
         for end in (["discard"], ["stop", "success"], ["discard"], ["stop"]):
             command(binary, runtime, "episode", "start", "--task", "put the cup away", *RIG)
-            record_sets(binary, runtime, "prune")
+            for _ in range(2):
+                record_sets(binary, runtime, "prune")
             command(binary, runtime, "episode", *end, *RIG)
             record_sets(binary, runtime, "prune")
         command(binary, runtime, "record", "stop", *RIG, codes=CODES)

@@ -16,7 +16,7 @@ mod table;
 
 use super::{EpisodeUse, Exporter, Output, Part, PartOut, PartSets, Parts, Plan, Source, VectorOptions};
 use depthrig_bus::StreamId;
-use depthrig_recorder::{Error, ErrorKind, Result};
+use depthrig_recorder::Result;
 use serde::Serialize;
 use serde_json::{Value, json};
 
@@ -48,20 +48,12 @@ pub struct LerobotOptions {
 
 /// The exporter to LeRobot v3.0.
 #[derive(Debug, Default)]
-pub struct Lerobot {
-    options: LerobotOptions,
-    plan: Option<plan::Plan>,
-}
+pub struct Lerobot(plan::Planned);
 
 impl Lerobot {
     /// With these options.
     pub const fn new(options: LerobotOptions) -> Self {
-        Self { options, plan: None }
-    }
-
-    fn planned(&self) -> Result<&plan::Plan> {
-        let missing = || Error::new(ErrorKind::BadInput, "an export must be planned before it is worked on");
-        self.plan.as_ref().ok_or_else(missing)
+        Self(plan::Planned::new(options))
     }
 }
 
@@ -75,17 +67,16 @@ impl Exporter for Lerobot {
     }
 
     fn takes(&self, signal: &StreamId) -> bool {
-        self.plan.iter().flat_map(|p| &p.schema.vectors).any(|v| v.signals().any(|s| s.id == *signal))
+        self.0.takes(signal)
     }
 
     fn options(&self) -> Value {
-        json!(self.options)
+        json!(self.0.options)
     }
 
     fn plan(&mut self, sources: &[Source]) -> Result<Plan> {
-        let plan = plan::Plan::make(sources, &self.options)?;
+        let plan = self.0.make(sources)?;
         let losses = [plan.schema.losses(), plan.losses.clone()].concat();
-        self.plan = Some(plan);
         let folders = ["data", "meta", "meta/episodes", "meta/episodes/chunk-000"].map(str::to_owned);
         Ok(Plan { folders: folders.into(), losses, ..Plan::by_segment(sources) })
     }
@@ -97,10 +88,10 @@ impl Exporter for Lerobot {
         sets: &mut PartSets<'_>,
         out: &mut PartOut<'_>,
     ) -> Result<()> {
-        part::write(self.planned()?, source, part, sets, out)
+        part::write(self.0.get()?, source, part, sets, out)
     }
 
     fn finish(&self, sources: &[Source], parts: &Parts<'_>, out: &Output<'_>) -> Result<()> {
-        finish::finish(self.planned()?, sources, parts, out)
+        finish::finish(self.0.get()?, sources, parts, out)
     }
 }

@@ -236,7 +236,7 @@ fn edges(tracks: &[Vec<Track>], times: &[i64]) -> impl Iterator<Item = usize> + 
     (0..begin).chain((n - end).max(begin)..n)
 }
 
-/// How many of these rows have no value before the first that has one.
+/// Number of rows without a value before the first that has one.
 fn without<'c>(rows: impl Iterator<Item = &'c Cell>) -> usize {
     rows.take_while(|c| c.is_missing).count()
 }

@@ -16,20 +16,12 @@ const LEVEL: i32 = 1;
 
 /// The exporter to Zarr.
 #[derive(Debug, Default)]
-pub struct Zarr {
-    options: LerobotOptions,
-    plan: Option<plan::Plan>,
-}
+pub struct Zarr(plan::Planned);
 
 impl Zarr {
     /// With these options.
     pub const fn new(options: LerobotOptions) -> Self {
-        Self { options, plan: None }
-    }
-
-    fn planned(&self) -> Result<&plan::Plan> {
-        let missing = || Error::new(ErrorKind::BadInput, "an export must be planned before it is worked on");
-        self.plan.as_ref().ok_or_else(missing)
+        Self(plan::Planned::new(options))
     }
 }
 
@@ -43,21 +35,20 @@ impl Exporter for Zarr {
     }
 
     fn takes(&self, signal: &StreamId) -> bool {
-        self.plan.iter().flat_map(|p| &p.schema.vectors).any(|v| v.signals().any(|s| s.id == *signal))
+        self.0.takes(signal)
     }
 
     fn options(&self) -> Value {
-        json!(self.options)
+        json!(self.0.options)
     }
 
     fn plan(&mut self, sources: &[Source]) -> Result<Plan> {
-        let plan = plan::Plan::make(sources, &self.options)?;
+        let plan = self.0.make(sources)?;
         let mut losses = plan.losses.clone();
         losses.push("a missing image reads as zeros, and is true in missing_CAMERA_STREAM".to_owned());
-        let arrays = names(&plan).into_iter().map(|name| format!("data/{name}"));
+        let arrays = names(plan).into_iter().map(|name| format!("data/{name}"));
         let folders =
             ["data".to_owned(), "meta".to_owned(), ENDS.to_owned()].into_iter().chain(arrays).collect();
-        self.plan = Some(plan);
         Ok(Plan { folders, losses, ..Plan::by_segment(sources) })
     }
 
@@ -68,7 +59,7 @@ impl Exporter for Zarr {
         sets: &mut PartSets<'_>,
         out: &mut PartOut<'_>,
     ) -> Result<()> {
-        let plan = self.planned()?;
+        let plan = self.0.get()?;
         let episode = &plan.episodes[part.source];
         let places = plan.schema.places(source);
         let mut present = Vec::new();
@@ -97,7 +88,7 @@ impl Exporter for Zarr {
     }
 
     fn finish(&self, sources: &[Source], parts: &Parts<'_>, out: &Output<'_>) -> Result<()> {
-        let plan = self.planned()?;
+        let plan = self.0.get()?;
         let rows = plan.rows() as usize;
         let mut missing = vec![vec![1_u8; rows]; plan.schema.features.len()];
         for source in 0..sources.len() {

@@ -1,4 +1,6 @@
 //! The writer thread: it alone owns the file.
+//!
+//! More than 500 lines, because everything that is written into a segment is one state of one thread.
 
 use super::ticket::{Encoded, Ticket};
 use super::topics::{Global, MOTION_CODEC, SEGMENT_METADATA, image_channel};

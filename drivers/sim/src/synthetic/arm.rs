@@ -28,7 +28,7 @@ const LINKS_M: [f32; 3] = [0.30, 0.28, 0.10];
 const FINGER_M: f32 = 0.06;
 /// Where the fingertips are at either end of the way.
 const ENDS: [Vec3; 2] = [Vec3::new(-0.075, 0.0, 0.055), Vec3::new(0.27, -0.12, 0.03)];
-/// How far the hand is lifted in the middle of the way.
+/// Height by which the hand is lifted in the middle of the way.
 const LIFT_M: f32 = 0.12;
 /// Distance of the fingers at either end, metres.
 const OPENING_M: [f32; 2] = [0.056, 0.02];

@@ -107,6 +107,35 @@ fn incomplete(source: &Source, schema: &Schema) -> Result<Vec<usize>> {
     Ok(found)
 }
 
+/// The options of an exporter with these rows, and its plan once it is made.
+#[derive(Debug, Default)]
+pub(crate) struct Planned {
+    pub(crate) options: LerobotOptions,
+    plan: Option<Plan>,
+}
+
+impl Planned {
+    pub(crate) const fn new(options: LerobotOptions) -> Self {
+        Self { options, plan: None }
+    }
+
+    /// Makes the plan.
+    pub(crate) fn make(&mut self, sources: &[Source]) -> Result<&Plan> {
+        Ok(self.plan.insert(Plan::make(sources, &self.options)?))
+    }
+
+    /// The plan.
+    pub(crate) fn get(&self) -> Result<&Plan> {
+        let missing = || Error::new(ErrorKind::BadInput, "an export must be planned before it is worked on");
+        self.plan.as_ref().ok_or_else(missing)
+    }
+
+    /// Says whether state or action has this signal.
+    pub(crate) fn takes(&self, signal: &StreamId) -> bool {
+        self.plan.iter().flat_map(|p| &p.schema.vectors).any(|v| v.signals().any(|s| s.id == *signal))
+    }
+}
+
 impl Plan {
     /// Decides how `sources` are exported; reads sets, without images, only where incomplete ones are left out.
     pub(crate) fn make(sources: &[Source], options: &LerobotOptions) -> Result<Self> {

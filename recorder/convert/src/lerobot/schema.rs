@@ -158,7 +158,7 @@ impl Schema {
         losses
     }
 
-    /// How the values of signals at a set come about, in words.
+    /// The rule for the values of signals at a set, in words.
     pub(crate) fn rule(&self) -> String {
         let max_gap_s = self.options.max_gap_ns as f64 / 1e9;
         let gaps = match self.options.gaps {

@@ -22,7 +22,7 @@ pub struct ArmSignals {
 }
 
 impl ArmSignals {
-    /// How many they are.
+    /// Number of the signals.
     pub const COUNT: usize = 3;
 
     /// Opens the channels.
