@@ -73,6 +73,18 @@ if [ ! -d "$DEPTHRIG_TEST_DATA/lingbot_depth" ]; then
     export DEPTHRIG_DATA_MISSING=1
 fi
 
+# Measured: a fresh clone grows by 12 GB, and some recordings in tests need 2 GB free to begin. Better one message here than ten
+# tests that fail.
+need=4
+[ -d "$target/debug/deps" ] || need=16
+for place in "$target" "$home"; do
+    free=$(($(stat --file-system --format='%a*%S' "$place") / 1000000000))
+    if [ "$free" -lt "$need" ]; then
+        echo "the tests need $need GB free for $place, $free GB are: free some space, or set CARGO_TARGET_DIR to another disk" >&2
+        exit 1
+    fi
+done
+
 # Tests of the network in ONNX Runtime skip themselves where it could not be fetched, and nowhere else.
 if compgen -G "$target/onnxruntime/cpu/libonnxruntime.so*" >/dev/null; then
     export DEPTHRIG_REQUIRE_ONNXRUNTIME=1
