@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import json
 import math
 import os
@@ -408,6 +409,33 @@ def open_reader(runtime: Path, name: str) -> depthrig.SignalReader:  # noqa: F81
         except depthrig.SignalNotFound:
             assert time.monotonic() < deadline
             time.sleep(0.05)
+
+
+def test_ten_kilohertz_are_recorded_and_what_a_stopped_daemon_misses_is_counted(
+    binary: str,  # noqa: F811
+    runtime: Path,  # noqa: F811
+    rig: tuple[Path, Path],
+) -> None:
+    path, folder = rig
+    with (
+        running(binary, runtime, folder / "fast.log", "run", str(path), codes=(0, 3)) as daemon,
+        publisher(runtime, "fast/joints", "a,b", 10_000),
+    ):
+        dataset = record(binary, runtime, folder, "fast")
+        wait_for_sets(binary, runtime, 5)
+        # The channel keeps 512 samples, which are 51 ms.
+        os.kill(daemon.pid, signals.SIGSTOP)
+        time.sleep(0.3)
+        os.kill(daemon.pid, signals.SIGCONT)
+        wait_for_sets(binary, runtime, 5)
+        command(binary, runtime, "record", "stop", codes=(0, 3))
+    numbers = [round(v.position[0]) for c, _, v in decoded(dataset) if c.topic.endswith("/joint_states")]
+    gaps = [b - a - 1 for a, b in itertools.pairwise(numbers)]
+    assert len(numbers) > 1000
+    assert min(gaps) >= 0
+    assert sum(gaps) > 0
+    said = json.loads(command(binary, runtime, "info", "--json", str(dataset)))["signals"]
+    assert [s["lost"] for s in said if s["signal"] == "fast/joints"] == [sum(gaps)]
 
 
 def test_a_publisher_with_other_fields_is_refused_by_name(binary: str, runtime: Path, rig: tuple[Path, Path]) -> None:  # noqa: F811
