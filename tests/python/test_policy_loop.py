@@ -6,6 +6,7 @@ The joints move on straight lines in time, so that the true value at the time of
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import re
 import signal
@@ -166,27 +167,32 @@ def test_actions_are_recorded(recorded: Recorded) -> None:
     assert [t for t in got if t >= recorded.sent[0]] == recorded.sent
 
 
-def replayed(binary: str, runtime: Path, dataset: Path, log: Path, pause_s: float = 0.0, **options: object) -> tuple[list[str], Report]:
-    """A digest of each observation of a replay, and the report."""
+def replayed(
+    binary: str, runtime: Path, dataset: Path, log: Path, pause_s: float = 0.0, steps: int | None = None, **options: object
+) -> tuple[list[str], Report]:
+    """A digest of each observation of a replay, and the report. With `steps` the dataset is replayed again and again."""
     digests: list[str] = []
+    numbers: list[int] = []
 
     def policy(seen: Observation) -> None:
         check_joints(seen)
         assert seen.replayed
-        digest = hashlib.sha256(str((seen.number, seen.time_ns)).encode())
+        numbers.append(seen.number)
+        digest = hashlib.sha256(str(seen.time_ns).encode())
         for name in [*IMAGES, *seen.signals]:
             digest.update(name.encode() + seen[name].tobytes())
         digests.append(digest.hexdigest())
         time.sleep(pause_s)
 
-    call = ["replay", str(dataset), "--as-fast-as-possible", "--paused", "-q"]
+    call = ["replay", str(dataset), "--as-fast-as-possible", "--paused", "-q", *(["--loop"] if steps else [])]
     with running(binary, runtime, log, *call, codes=(0, 3)), loop(runtime, **options) as policy_loop:
         until = time.monotonic() + WAIT_S
         while not (runtime / "policy.sock").exists():
             assert time.monotonic() < until
             time.sleep(0.02)
         command(binary, runtime, "replay", "resume")
-        report = policy_loop.run(policy)
+        report = policy_loop.run(policy, steps=steps)
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
     return digests, report
 
 
@@ -219,6 +225,20 @@ def test_a_sample_is_in_time_or_not_whatever_the_reader_does(
         found.append(digests)
     assert len(found[0]) > 0
     assert found[0] == found[1] == found[2]
+
+
+def test_a_replay_in_a_loop_gives_the_same_observations_each_round(
+    binary: str, runtime: Path, recorded: Recorded, tmp_path: Path
+) -> None:
+    once, _ = replayed(binary, runtime, recorded.dataset, tmp_path / "log", wait=0.05)
+    thrice, report = replayed(binary, runtime, recorded.dataset, tmp_path / "log", steps=3 * len(once), wait=0.05)
+    assert set(report.missed.values()) == {0}
+    # The last sets of a round: the samples after them are those of the next round, and they are counted.
+    order = [once.index(digest) for digest in thrice]
+    ends = [i for i, (a, b) in enumerate(itertools.pairwise(order)) if b != a + 1]
+    assert len(ends) >= 2
+    assert all(order[i + 1] == 0 and order[i] >= len(once) - 5 for i in ends)
+    assert report.no_sample["joints"] > 0
 
 
 def test_a_rate_thins_a_replay_by_its_recorded_times(binary: str, runtime: Path, recorded: Recorded, tmp_path: Path) -> None:

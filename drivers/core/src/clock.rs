@@ -29,7 +29,7 @@ mod types;
 mod unwrap;
 
 use depthrig_bus::{FrameFlags, HostTime};
-use hull::{Hull, Line, Point};
+pub use hull::{Hull, Line, Point};
 use judge::Verdict;
 use probe::{Latency, Probes};
 use trust::{Residuals, Trust};

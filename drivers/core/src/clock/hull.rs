@@ -17,24 +17,29 @@ const MAX_SLICES: usize = 2 * SLICES as usize;
 /// Vertices at most. A window of real frames has under a hundred; this bounds memory for input that is not.
 const MAX_VERTICES: usize = 4096;
 
-/// A point: device time and arrival minus device time, both in nanoseconds since the epoch's first frame.
+/// A moment on two clocks: of a device and the host, or of two hosts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Point {
+pub struct Point {
+    /// Device time, nanoseconds since the epoch's first frame.
     pub x: i64,
+    /// Arrival minus device time, nanoseconds.
     pub d: i64,
 }
 
 /// A line `d(x) = d0 + slope (x - x0)`; `slope` is the host's rate over the device's, minus one.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Line {
+pub struct Line {
+    /// A time on the line.
     pub x0: i64,
+    /// Its height there, nanoseconds.
     pub d0: i64,
+    /// Rise per nanosecond.
     pub slope: f64,
 }
 
 impl Line {
     /// The line's height over `x`, nanoseconds.
-    pub(super) fn at(&self, x: i64) -> f64 {
+    pub fn at(&self, x: i64) -> f64 {
         self.d0 as f64 + self.slope * (x.saturating_sub(self.x0)) as f64
     }
 }
@@ -49,7 +54,7 @@ struct Slice {
 
 /// Lower convex hull of the last `window_ns`.
 #[derive(Debug)]
-pub(super) struct Hull {
+pub struct Hull {
     window_ns: i64,
     /// Old points stay until the newer ones span this much: a pause must not leave a slope without a lever.
     keep_ns: i64,
@@ -60,7 +65,8 @@ pub(super) struct Hull {
 }
 
 impl Hull {
-    pub(super) fn new(window_ns: i64, keep_ns: i64) -> Self {
+    /// An empty hull of the last `window_ns` nanoseconds; a pause never leaves less than `keep_ns` of history.
+    pub fn new(window_ns: i64, keep_ns: i64) -> Self {
         let slice_ns = (window_ns / SLICES).max(1);
         Self {
             window_ns,
@@ -72,7 +78,8 @@ impl Hull {
         }
     }
 
-    pub(super) fn clear(&mut self) {
+    /// Forgets every point.
+    pub fn clear(&mut self) {
         self.vertices.clear();
         self.slices.clear();
         self.count = 0;
@@ -98,7 +105,7 @@ impl Hull {
 
     /// Takes a point; one that is not later than the last is only used when it is lower at the same time.
     /// `slope` says what "lowest of its slice" means: lowest above a line of this slope.
-    pub(super) fn push(&mut self, p: Point, slope: f64) {
+    pub fn push(&mut self, p: Point, slope: f64) {
         if self.vertices.back().is_some_and(|v| p.x < v.x || (p.x == v.x && p.d >= v.d)) {
             return;
         }
@@ -168,7 +175,7 @@ impl Hull {
     }
 
     /// The highest line of the given slope that no point lies below; none while the hull is empty.
-    pub(super) fn support(&self, slope: f64) -> Option<Line> {
+    pub fn support(&self, slope: f64) -> Option<Line> {
         let x0 = self.vertices.front()?.x;
         let height = |v: &Point| v.d as f64 - slope * (v.x - x0) as f64;
         let lowest = self.vertices.iter().min_by(|a, b| height(a).total_cmp(&height(b)))?;

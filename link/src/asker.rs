@@ -1,0 +1,171 @@
+//! Asks another host for its clock, and keeps the offset.
+
+use crate::corridor::{Corridor, Exchange, Reading, Taken};
+use crate::stamped::Stamped;
+use crate::wire::{Answer, LENGTH, Question};
+use core::time::Duration;
+use depthrig_bus::{HostTime, sync::lock};
+use serde::Serialize;
+use std::collections::VecDeque;
+use std::fs::File;
+use std::io::{self, Read};
+use std::net::{SocketAddr, UdpSocket};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+
+/// From one question to the next.
+const EVERY: Duration = Duration::from_millis(50);
+/// Questions whose answers may still come: two seconds.
+const OUTSTANDING: usize = 40;
+
+/// How it goes with the other host's clock.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[non_exhaustive]
+pub struct AskerState {
+    /// Questions sent.
+    pub asked: u64,
+    /// Answers that were of use.
+    pub answered: u64,
+    /// Packets that were no answer to a question of ours, came twice, or contradict themselves.
+    pub refused: u64,
+    /// Changes of a clock's rate that the corridor followed.
+    pub bends: u64,
+    /// Which clock answers ([`crate::identity`]); 0 before the first answer.
+    pub clock: u64,
+    /// Time on the way of the newest answer, both ways together, nanoseconds.
+    pub round_trip_ns: i64,
+    /// When the newest answer had arrived; 0 before the first.
+    pub last_answer: HostTime,
+}
+
+/// A thread that asks until this is dropped.
+#[derive(Debug)]
+pub struct Asker {
+    shared: Arc<Shared>,
+    thread: Option<JoinHandle<()>>,
+}
+
+#[derive(Debug, Default)]
+struct Shared {
+    stop: AtomicBool,
+    clock: Mutex<(Corridor, AskerState)>,
+}
+
+impl Asker {
+    /// Asks the host at `address`, whether it answers yet or not.
+    ///
+    /// # Errors
+    /// When there is no route to it, or no thread can be started.
+    pub fn start(address: SocketAddr) -> io::Result<Self> {
+        let any: SocketAddr =
+            if address.is_ipv4() { "0.0.0.0:0" } else { "[::]:0" }.parse().map_err(io::Error::other)?;
+        let socket = UdpSocket::bind(any)?;
+        // The kernel hands over packets of this host alone.
+        socket.connect(address)?;
+        let random = File::open("/dev/urandom")?;
+        let asking = Asking { socket: Stamped::new(socket)?, random, outstanding: VecDeque::new() };
+        let shared = Arc::new(Shared::default());
+        let of_thread = Arc::clone(&shared);
+        let thread = std::thread::Builder::new()
+            .name("link_clock".to_owned())
+            .spawn(move || asking.run(&of_thread))?;
+        Ok(Self { shared, thread: Some(thread) })
+    }
+
+    /// The remote clock at a local time; none before the first answer.
+    pub fn at(&self, local: HostTime) -> Option<Reading> {
+        lock(&self.shared.clock).0.at(local)
+    }
+
+    /// How it goes.
+    pub fn state(&self) -> AskerState {
+        lock(&self.shared.clock).1
+    }
+}
+
+impl Drop for Asker {
+    fn drop(&mut self) {
+        self.shared.stop.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+struct Asking {
+    socket: Stamped,
+    random: File,
+    /// Questions without an answer, and when they were sent.
+    outstanding: VecDeque<([u8; 16], HostTime)>,
+}
+
+impl Asking {
+    fn run(mut self, shared: &Shared) {
+        let mut next = HostTime::now();
+        while !shared.stop.load(Ordering::Relaxed) {
+            next = next.plus(EVERY).max(HostTime::now());
+            if let Err(e) = self.ask(shared) {
+                tracing::debug!("the clock of the other host is not asked: {e}");
+            }
+            while self.wait(shared, next) {}
+        }
+    }
+
+    fn ask(&mut self, shared: &Shared) -> io::Result<()> {
+        let mut nonce = [0; 16];
+        self.random.read_exact(&mut nonce)?;
+        if self.outstanding.len() == OUTSTANDING {
+            self.outstanding.pop_front();
+        }
+        let question = Question { nonce }.to_bytes();
+        lock(&shared.clock).1.asked += 1;
+        let sent = HostTime::now();
+        self.outstanding.push_back((nonce, sent));
+        self.socket.socket().send(&question).map(drop)
+    }
+
+    /// Waits for a packet until it is time for the next question; `false` when it is.
+    fn wait(&mut self, shared: &Shared, next: HostTime) -> bool {
+        let left = next.from_now();
+        if left.is_zero() {
+            return false;
+        }
+        let mut buffer = [0; LENGTH];
+        let received =
+            self.socket.socket().set_read_timeout(Some(left)).and_then(|()| self.socket.receive(&mut buffer));
+        let received = match received {
+            Ok(Some(received)) => received,
+            Ok(None) => return false,
+            Err(_) => {
+                // Nobody listens there yet.
+                std::thread::sleep(next.from_now());
+                return false;
+            }
+        };
+        let answer = buffer.get(..received.length).and_then(Answer::from_bytes);
+        let asked = answer.and_then(|a| self.outstanding.iter().position(|(nonce, _)| *nonce == a.nonce));
+        let question = asked.and_then(|i| self.outstanding.remove(i));
+        let mut clock = lock(&shared.clock);
+        let (corridor, state) = &mut *clock;
+        let taken = answer.zip(question).map(|(a, (_, t1))| {
+            if a.clock != state.clock {
+                // Another computer, or this one after a start: what the clock said before is of no use.
+                corridor.restart();
+                state.clock = a.clock;
+            }
+            let exchange = Exchange { t1: t1.ns(), t2: a.t2, t3: a.t3, t4: received.at.ns() };
+            (exchange, corridor.take(exchange))
+        });
+        match taken {
+            None | Some((_, Taken::Refused)) => state.refused += 1,
+            Some((exchange, taken)) => {
+                state.answered += 1;
+                state.bends += u64::from(taken == Taken::Bent);
+                state.round_trip_ns = exchange.round_trip_ns();
+                state.last_answer = received.at;
+            }
+        }
+        true
+    }
+}
