@@ -7,6 +7,7 @@
 mod camera;
 pub(crate) mod controls;
 mod error;
+mod link;
 pub(crate) mod pose;
 pub(crate) mod read;
 mod refine;
@@ -25,7 +26,7 @@ pub use error::{ConfigError, Problem};
 pub use stereo::StereoConfig;
 
 use crate::family::{FAMILIES, Family};
-use depthrig_bus::{CameraName, Pose, RigName, SignalName, StreamName};
+use depthrig_bus::{CameraName, Name, Pose, RigName, SignalName, StreamName};
 use depthrig_calibrate::file::{CalibratedCamera, Calibration, DepthCorrection, lens_position};
 use depthrig_driver::{StreamProfile, StreamRequest};
 use depthrig_stereo::StereoOptions;
@@ -68,10 +69,30 @@ pub struct RigConfig {
     pub cameras: Vec<CameraConfig>,
     /// Signals that the file names; others are recorded as well.
     pub signals: Vec<SignalConfig>,
+    /// Its part in a rig of several computers.
+    pub link: Option<LinkConfig>,
     /// The file's text.
     pub text: String,
     /// The file, if it came from one; absolute.
     pub path: Option<PathBuf>,
+}
+
+/// The part of this computer in a rig of several computers.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct LinkConfig {
+    /// Name of this computer, unique in the rig.
+    pub host: Name,
+    /// Its role there.
+    pub role: LinkRole,
+}
+
+/// Whose clock is that of the session.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LinkRole {
+    /// This computer's; it answers questions about it at this address.
+    Recorder(SocketAddr),
+    /// That of the computer at this address.
+    Camera(SocketAddr),
 }
 
 /// A signal that the rig needs.

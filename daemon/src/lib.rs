@@ -15,6 +15,7 @@ mod error;
 pub mod family;
 mod foxglove;
 mod housekeeping;
+mod link;
 mod losses;
 pub mod metrics;
 mod priority;

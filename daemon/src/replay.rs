@@ -20,6 +20,7 @@
 mod control;
 mod player;
 mod refine;
+mod session_clock;
 mod signals;
 mod source;
 mod timeline;
@@ -336,6 +337,7 @@ fn recording_config(sources: &mut Sources) -> RigConfig {
         calibration_text: sources.session().calibration.clone(),
         signals: Vec::new(),
         cameras: Vec::new(),
+        link: None,
         text: sources.session().rig_config.clone(),
         path: None,
     }

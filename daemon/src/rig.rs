@@ -25,6 +25,7 @@ use crate::camera::{Camera, Shared};
 use crate::config::RigConfig;
 use crate::control::{Control, Shows};
 use crate::family::Preparation;
+use crate::link::Link;
 use crate::recording::{Outside, Recording, Reports, recover_left};
 use crate::sets::SpreadStats;
 use crate::stage::{Intake, Stage};
@@ -151,6 +152,8 @@ pub struct Inner {
     runtime: RuntimeDir,
     /// Sets that wait for refined depth.
     held_sets: AtomicUsize,
+    /// The clock of the session, in a rig of several computers.
+    link: Option<Arc<Link>>,
 }
 
 /// The set assembler's numbers, as `status` shows them.
@@ -195,6 +198,7 @@ impl Rig {
             stage: intake,
             bus,
         });
+        let link = config.link.as_ref().map(Link::start).transpose()?.map(Arc::new);
         let late_after_ns = live_late_ns((1e9 / config.sets.rate_hz) as i64);
         let inner = Arc::new(Inner {
             cameras: config.cameras.iter().map(|c| Arc::new(Camera::new(c.clone()))).collect(),
@@ -221,6 +225,7 @@ impl Rig {
             shows: options.shows.clone(),
             runtime: options.runtime.clone(),
             held_sets: AtomicUsize::new(0),
+            link,
         });
         let assembly = Assembly::new(Arc::clone(&inner))?;
         let signals = signals::Collector::new(Arc::clone(&inner))?;
@@ -242,6 +247,10 @@ impl Rig {
         }
         rig.spawn("sets", move |stop| assembly.run(stop))?;
         rig.spawn("signals", move |stop| signals.run(stop))?;
+        if let Some(link) = rig.inner.link.clone() {
+            let publisher = link.publisher(&options.runtime)?;
+            rig.spawn("link", move |stop| publisher.run(&link, stop))?;
+        }
         let inner = Arc::clone(&rig.inner);
         rig.spawn("housekeeping", move |stop| housekeeping(&inner, stop))?;
         if rig.inner.config.recording.recover_on_start {

@@ -35,6 +35,8 @@ pub enum PhasePolicy {
     /// Where the frames of one tick lie closest together; followed slowly as the cameras drift.
     #[default]
     MinimiseSpread,
+    /// On multiples of the period on another host's clock ([`Assembler::align`]); until it is known, of the host's own.
+    Aligned,
 }
 
 /// Rules for building sets. Times are nanoseconds.

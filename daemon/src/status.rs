@@ -24,6 +24,9 @@ pub struct RigStatus {
     /// Signals that are published, and those that the rig file names.
     #[serde(default)]
     pub signals: Vec<SignalStatus>,
+    /// The clock of the session, in a rig of several computers.
+    #[serde(default)]
+    pub link: Option<LinkStatus>,
     /// The set assembler.
     pub sets: SetStatus,
     /// The recording in progress, or the last one.
@@ -51,6 +54,47 @@ pub struct SignalStatus {
     pub samples: u64,
     /// Samples that were replaced on the channel before they were read.
     pub missed: u64,
+}
+
+/// The clock of a session of several computers, as this one knows it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct LinkStatus {
+    /// Name of this computer in the rig.
+    pub host: String,
+    /// The computer whose clock is that of the session; `None` if it is this one.
+    pub recorder: Option<String>,
+    /// Whether it answers.
+    pub state: LinkState,
+    /// Its clock minus this one, seconds; `None` before the first answer.
+    pub offset_s: Option<f64>,
+    /// The offset is wrong by no more than this, microseconds.
+    pub uncertainty_us: Option<f64>,
+    /// Rate of its clock over this one, minus one, in parts per million.
+    pub rate_ppm: Option<f64>,
+    /// Counts steps of the clocks.
+    pub epoch: Option<u32>,
+    /// Time on the way of the newest answer, both ways together, microseconds.
+    pub round_trip_us: Option<f64>,
+    /// How long ago the newest answer came, seconds.
+    pub age_s: Option<f64>,
+    /// Questions asked; on the recorder's computer those it answered.
+    pub exchanges: u64,
+    /// Packets that were of no use.
+    pub refused: u64,
+}
+
+/// Whether the clock of the session is known.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LinkState {
+    /// It is this computer's.
+    Own,
+    /// Answers come.
+    Live,
+    /// No answer came for two seconds; the offset is that of before, with an uncertainty that grows.
+    Silent,
+    /// There was no answer yet.
+    Unknown,
 }
 
 /// Whether samples of a signal come.

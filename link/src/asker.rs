@@ -43,6 +43,7 @@ pub struct AskerState {
 #[derive(Debug)]
 pub struct Asker {
     shared: Arc<Shared>,
+    address: SocketAddr,
     thread: Option<JoinHandle<()>>,
 }
 
@@ -56,7 +57,7 @@ impl Asker {
     /// Asks the host at `address`, whether it answers yet or not.
     ///
     /// # Errors
-    /// When there is no route to it, or no thread can be started.
+    /// When the kernel knows no route to it, or no thread can be started.
     pub fn start(address: SocketAddr) -> io::Result<Self> {
         let any: SocketAddr =
             if address.is_ipv4() { "0.0.0.0:0" } else { "[::]:0" }.parse().map_err(io::Error::other)?;
@@ -70,12 +71,17 @@ impl Asker {
         let thread = std::thread::Builder::new()
             .name("link_clock".to_owned())
             .spawn(move || asking.run(&of_thread))?;
-        Ok(Self { shared, thread: Some(thread) })
+        Ok(Self { shared, address, thread: Some(thread) })
     }
 
     /// The remote clock at a local time; none before the first answer.
     pub fn at(&self, local: HostTime) -> Option<Reading> {
         lock(&self.shared.clock).0.at(local)
+    }
+
+    /// The host that is asked.
+    pub const fn address(&self) -> SocketAddr {
+        self.address
     }
 
     /// How it goes.

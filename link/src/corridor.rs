@@ -5,7 +5,7 @@
 //! of the second. Over ten seconds two crystals differ by a straight line. Of the lines in this corridor the one with the most
 //! room is the estimate, in the middle of it, and the range of all of them is its uncertainty. A queue in the network only
 //! adds points that bound nothing; an asymmetry of the route stays unseen, as for every two-way exchange, but it is within
-//! the uncertainty as long as neither way is negative. A clock that is being slewed is no straight line: until the corridor has bent, in a few
+//! the uncertainty as long as neither way is negative. While a clock is being slewed, and until the corridor has bent, in a few
 //! exchanges, the error is bounded by the round trip alone.
 //!
 //! The two edges of the corridor are convex hulls, those of [`depthrig_driver::clock`].
@@ -66,7 +66,7 @@ impl Exchange {
     }
 }
 
-/// What an exchange did to the corridor.
+/// Effect of an exchange on the corridor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Taken {
     /// It fits.

@@ -31,7 +31,7 @@ impl Question {
         packet(0, self.nonce, [0; 3])
     }
 
-    /// The question in a packet; `None` when it is none of this version.
+    /// The question in a packet; `None` for other packets.
     pub fn from_bytes(bytes: &[u8]) -> Option<Self> {
         let (nonce, _) = parts(bytes, 0)?;
         Some(Self { nonce })
@@ -44,7 +44,7 @@ impl Answer {
         packet(1, self.nonce, [self.clock.cast_signed(), self.t2, self.t3])
     }
 
-    /// The answer in a packet; `None` when it is none of this version.
+    /// The answer in a packet; `None` for other packets.
     pub fn from_bytes(bytes: &[u8]) -> Option<Self> {
         let (nonce, [clock, t2, t3]) = parts(bytes, 1)?;
         Some(Self { nonce, clock: clock.cast_unsigned(), t2, t3 })

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""Two computers out of one: two network namespaces joined by a wire, one of them with a clock that is SHIFT seconds ahead.
+"""Two computers out of one: two network namespaces joined by a wire, one of them with a clock that is SHIFT ns ahead.
 
-    unshare -Urn tests/link/two_hosts.py [--shift S] [--rate 1gbit] [--load] THERE... -- HERE...
+    unshare -Urn tests/link/two_hosts.py [--shift NS] [--rate 1gbit] [--load] THERE... -- HERE...
 
 THERE runs on the host 10.77.0.2 whose clock is ahead, and has its standard input until HERE, on 10.77.0.1, has ended. `--load` saturates the
 wire both ways with TCP. Needs no privilege but a user namespace.
@@ -16,6 +16,16 @@ import threading
 import time
 
 HERE, THERE = "10.77.0.1", "10.77.0.2"
+# No multiple of a period of frame sets.
+SHIFT_NS = 1_234_567_890_123
+# Its children get a clock of their own; `unshare --monotonic` knows whole seconds alone.
+ENTER = """
+import ctypes, os, sys
+if ctypes.CDLL(None, use_errno=True).unshare(0x80): raise OSError(ctypes.get_errno(), 'unshare')
+s, ns = divmod(int(sys.argv[1]), 1_000_000_000)
+open('/proc/self/timens_offsets', 'w').write(f'monotonic {s} {ns}\\nboottime {s} {ns}\\n')
+os.execvp(sys.argv[2], sys.argv[2:])
+"""
 SINK = """
 import socket, threading
 def pour(c):
@@ -60,15 +70,14 @@ def saturate(stop: threading.Event) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser()
-    parser.add_argument("--shift", type=int, default=1234)
+    parser.add_argument("--shift", type=int, default=SHIFT_NS)
     parser.add_argument("--rate", default="1gbit")
     parser.add_argument("--load", action="store_true")
     parser.add_argument("programs", nargs=argparse.REMAINDER)
     options = parser.parse_args()
     cut = options.programs.index("--")
     there, here = options.programs[:cut], options.programs[cut + 1 :]
-    shift = str(options.shift)
-    enter = ["unshare", "-npT", "--monotonic", shift, "--boottime", shift, "--fork", "--kill-child"]
+    enter = [sys.executable, "-c", ENTER, str(options.shift), "unshare", "-np", "--fork", "--kill-child"]
     settle = f"read -r _; ip addr add {THERE}/24 dev there; ip link set there up; ip link set lo up; "
     limit = f"tc qdisc add dev there root tbf rate {options.rate} burst 128k limit 1m; " if options.rate else ""
     sink = f"{sys.executable} -c '{SINK}' & " if options.load else ""

@@ -17,7 +17,7 @@ from test_daemon import binary  # noqa: F401
 
 ROOT = Path(__file__).parents[2]
 HOSTS = ROOT / "tests/link/two_hosts.py"
-SHIFT_S = 1234
+SHIFT_NS = 1_234_567_890_123
 
 
 @dataclass(frozen=True)
@@ -45,13 +45,13 @@ def test_the_offset_of_another_host_is_within_its_uncertainty(clocks: str, load:
         pytest.skip("this computer gives an ordinary user no namespaces")
     there = [clocks, "answer", "10.77.0.2:7447"]
     here = [clocks, "ask", "10.77.0.2:7447", "12"]
-    command = [*enter, sys.executable, str(HOSTS), "--shift", str(SHIFT_S), *load, *there, "--", *here]
+    command = [*enter, sys.executable, str(HOSTS), "--shift", str(SHIFT_NS), *load, *there, "--", *here]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, stdin=subprocess.DEVNULL)
     assert done.returncode == 0, done.stdout[-1000:] + done.stderr
     got = readings(done.stdout)
     assert len(got) > 500, done.stdout[-1000:] + done.stderr
     # Both namespaces are one computer: the clocks are exactly so far apart.
-    wrong = [r for r in got if abs(r.offset_ns - SHIFT_S * 1_000_000_000) > r.uncertainty_ns]
+    wrong = [r for r in got if abs(r.offset_ns - SHIFT_NS) > r.uncertainty_ns]
     assert wrong == []
     assert {r.epoch for r in got} == {1}
 

@@ -5,8 +5,8 @@ use crate::printable::{BOLD, GREEN, RED, RESET, YELLOW};
 use core::fmt::Write as _;
 use depthrig_bus::DropReason;
 use depthrig_daemon::status::{
-    CameraState, CameraStatus, PreparingStatus, RecordingStatus, RefineState, ReplayStatus, RigStatus,
-    SignalState, SignalStatus, StreamStatus,
+    CameraState, CameraStatus, LinkState, LinkStatus, PreparingStatus, RecordingStatus, RefineState,
+    ReplayStatus, RigStatus, SignalState, SignalStatus, StreamStatus,
 };
 use depthrig_recorder::report::page;
 use std::collections::BTreeMap;
@@ -64,6 +64,7 @@ pub fn status(rig: &RigStatus, style: Style) -> String {
     ];
     lines.extend(rig.preparing.as_ref().map(|p| preparing(p, style)));
     lines.extend(rig.replay.iter().map(|r| format!("replay  {}", replay(r))));
+    lines.extend(rig.link.iter().flat_map(|l| link(l, style)));
     lines.extend(rig.recording.iter().flat_map(|r| recording(r, style)));
     lines.push(format!(
         "memory  /dev/shm {} free; {} slots a stream, {} in all",
@@ -83,6 +84,37 @@ pub fn status(rig: &RigStatus, style: Style) -> String {
         lines.extend(troubles);
     }
     lines.join("\n")
+}
+
+/// The clock of a session of several computers: a line, and the cure if it does not answer.
+fn link(link: &LinkStatus, style: Style) -> Vec<String> {
+    let host = &link.host;
+    let Some(recorder) = &link.recorder else {
+        let answered = out::count(link.exchanges, "question");
+        return vec![format!("link    {host}: the clock of the session is here, {answered} answered")];
+    };
+    let within_us = link.uncertainty_us.unwrap_or_default();
+    let clock = format!(
+        "{host}: {recorder} is {:+.6} s, within {within_us:.0} us",
+        link.offset_s.unwrap_or_default()
+    );
+    let age_s = link.age_s.unwrap_or_default();
+    let cure = || "        run depthrig there with listen in [link], let UDP pass its firewall".to_owned();
+    match link.state {
+        LinkState::Own | LinkState::Live => vec![format!("link    {clock}")],
+        LinkState::Silent => {
+            vec![
+                format!("link    {clock}, {}", style.paint(RED, &format!("silent for {age_s:.0} s"))),
+                cure(),
+            ]
+        }
+        LinkState::Unknown => {
+            vec![
+                format!("link    {host}: {}", style.paint(RED, &format!("{recorder} does not answer"))),
+                cure(),
+            ]
+        }
+    }
 }
 
 /// A line for each signal.

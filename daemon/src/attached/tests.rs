@@ -128,6 +128,7 @@ pub(crate) fn rig_with(port: &str) -> RigStatus {
         cpu_cores: 0.0,
         replay: None,
         signals: Vec::new(),
+        link: None,
     }
 }
 

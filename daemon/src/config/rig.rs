@@ -4,7 +4,7 @@ use super::read::{FromToml, Report, Section};
 use super::value::{above_zero, not_empty, rate, resolve, within};
 use super::{
     BusConfig, ColorCodec, ConfigError, ControlConfig, DepthCodec, MAX_CAMERAS, Phase, Port, RecordingConfig,
-    RigConfig, SetsConfig, SignalConfig, SupervisorConfig, camera, refine,
+    RigConfig, SetsConfig, SignalConfig, SupervisorConfig, camera, link, refine,
 };
 use crate::family::Family;
 use depthrig_bus::{RigName, SignalName};
@@ -55,6 +55,7 @@ pub(super) fn read(
     let cdm = refine::cdm(&top, &base);
     let cameras = cameras(&top, &base, families);
     let signals = signals(&top);
+    let link = link::read(&top);
     check_set_rate(&top, &sets, &cameras);
     top.finish();
     let text = text.to_owned();
@@ -76,6 +77,7 @@ pub(super) fn read(
         calibration_text: String::new(),
         cameras,
         signals,
+        link,
         text,
         path,
     })

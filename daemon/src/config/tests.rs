@@ -17,6 +17,7 @@ use depthrig_zed::replay::ZedPlaybackConfig;
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
+mod link;
 mod paper;
 
 fn parse(text: &str) -> Result<RigConfig, ConfigError> {

@@ -125,6 +125,7 @@ fn rig() -> RigStatus {
         cpu_cores: 0.75,
         replay: None,
         signals: Vec::new(),
+        link: None,
     }
 }
 

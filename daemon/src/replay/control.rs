@@ -218,6 +218,7 @@ impl Control for Inner {
             },
             cpu_cores: self.cpu_millicores.load(Ordering::Relaxed) as f64 / 1000.0,
             signals: Vec::new(),
+            link: None,
             replay: Some(self.replay_status()),
         }
     }

@@ -1,9 +1,7 @@
 //! The signals of a replay: published on their channels with the times of the recording.
 
 use super::Inner;
-use depthrig_bus::{
-    HostTime, RuntimeDir, SignalFlags, SignalHeader, SignalPublisher, SignalSample, Signals, Stamp,
-};
+use depthrig_bus::{RuntimeDir, SignalFlags, SignalHeader, SignalPublisher, SignalSample, Signals, Stamp};
 use depthrig_recorder::{RecordSignal, SignalRecord};
 
 /// The channels of the signals.
@@ -83,14 +81,26 @@ pub(super) fn changed(sample: &SignalSample, change: impl FnOnce(&mut SignalHead
     SignalSample::new(header, sample.description(), sample.bytes().to_vec()).ok()
 }
 
-/// The same sample on a clock that is `shift_ns` ahead. Its publisher is known by a time of that clock as well.
-pub(super) fn shifted(sample: &SignalSample, shift_ns: i64) -> Option<SignalSample> {
-    if shift_ns == 0 {
+/// The same sample on a clock that is `shift_ns` ahead. Its publisher is known by a time of that clock as well, which is `session_shift_ns`
+/// ahead for all of its samples. `after` is the time of the sample before it, and stays before it although the shift may shrink.
+pub(super) fn shifted(
+    sample: &SignalSample,
+    shift_ns: i64,
+    session_shift_ns: i64,
+    after: &mut Option<(u64, i64)>,
+) -> Option<SignalSample> {
+    if shift_ns == 0 && session_shift_ns == 0 {
         return Some(sample.clone());
     }
     changed(sample, |h| {
-        h.time_ns = HostTime::from_ns(h.time_ns).plus_ns(shift_ns).ns();
+        h.session = h.session.saturating_add_signed(session_shift_ns).max(1);
+        h.time_ns = h.time_ns.saturating_add(shift_ns);
+        if let Some((session, time_ns)) = *after
+            && session == h.session
+        {
+            h.time_ns = h.time_ns.max(time_ns.saturating_add(1));
+        }
         h.publish_time_ns = h.publish_time_ns.saturating_add(shift_ns);
-        h.session = h.session.saturating_add_signed(shift_ns).max(1);
+        *after = Some((h.session, h.time_ns));
     })
 }

@@ -1,9 +1,10 @@
 //! Where replayed sets come from: one or several datasets, read as the sets of one rig.
 
+use super::session_clock::{Place, SessionClock};
 use super::signals::shifted;
 use super::timeline::{Part, Timeline};
 use crate::{Error, ErrorKind, Result};
-use depthrig_bus::{FrameHeader, HostTime, PixelFormat, RigName};
+use depthrig_bus::{FrameFlags, FrameHeader, HostTime, PixelFormat, RigName};
 use depthrig_recorder::{
     ColorCodec, Computed, Dataset, DatasetFrame, DatasetSet, DepthCodec, MotionRecord, PixelMode,
     RecordMotion, RecordSignal, Session, SetReader, SignalRecord, StreamRecord,
@@ -33,11 +34,19 @@ struct Source {
     reader: SetReader,
     /// The rig's stream of each stream of this dataset.
     streams: Vec<usize>,
+    /// Its log times, of a rig of several computers on the session's clock.
+    times: Vec<i64>,
+    /// Its clock, of such a rig.
+    clock: Option<SessionClock>,
     /// The rig's IMU of each of this dataset; `None` where a dataset before it gives the same unit at the same
     /// times, as a recording and a dataset computed from it do.
     units: Vec<Option<usize>>,
     /// The same of its signals; also `None` where another dataset has other fields by that name.
     signals: Vec<Option<usize>>,
+    /// The set that was read last.
+    read: usize,
+    /// Of each signal the publisher and the time of its last sample, where sets are read in order.
+    after: Vec<Option<(u64, i64)>>,
 }
 
 /// One moment of a replay: a set, or several that were paired.
@@ -72,18 +81,37 @@ impl Sources {
         let mut signals: Vec<SignalRecord> = Vec::new();
         for path in paths {
             let dataset = Dataset::open(path).map_err(Error::from)?;
-            let reader = dataset.set_reader().map_err(Error::from)?;
+            let mut reader = dataset.set_reader().map_err(Error::from)?;
             if reader.times().is_empty() {
                 let shown = path.display();
                 let why = reader.problems().first().map_or(String::new(), |p| format!(": {p}"));
                 let message = format!("{shown} holds no frame set, there is nothing to replay{why}");
                 return Err(Error::new(ErrorKind::Other, message));
             }
+            // One dataset is replayed on its own clock.
+            let mut clock =
+                if paths.len() > 1 { SessionClock::of(dataset.session(), &mut reader) } else { None };
+            let first = sources.first().and_then(|s: &Source| s.clock.as_ref());
+            if let (Some(own), Some(first)) = (&clock, first)
+                && own.clock != first.clock
+            {
+                return Err(bad(format!(
+                    "{} is of another session than {}: the clock that its computer followed is another one",
+                    dataset.path().display(),
+                    sources[0].dataset.path().display()
+                )));
+            }
+            // Beside a dataset without the session's clock all go by UTC.
+            clock = clock.filter(|_| first.is_some() || sources.is_empty());
+            let times = match &clock {
+                Some(clock) => clock.times(first.unwrap_or(clock).utc_offset_ns),
+                None => reader.times().to_vec(),
+            };
             let mut indices = Vec::new();
             for record in &dataset.session().streams {
                 indices.push(join(&mut streams, record, &dataset)?);
             }
-            let overlaps = |s: &Source| overlap(s.reader.times(), reader.times());
+            let overlaps = |s: &Source| overlap(&s.times, &times);
             let given: BTreeSet<usize> = sources
                 .iter()
                 .filter(|s| overlaps(s))
@@ -97,13 +125,33 @@ impl Sources {
                 .flat_map(|s| s.signals.iter().flatten().copied())
                 .collect();
             let mut signal = |record| join_signal(&mut signals, record).filter(|i| !given.contains(i));
-            let signals = dataset.session().signals.iter().map(&mut signal).collect();
-            sources.push(Source { dataset, reader, streams: indices, units: of_rig, signals });
+            let signals: Vec<_> = dataset.session().signals.iter().map(&mut signal).collect();
+            let after = vec![None; signals.len()];
+            sources.push(Source {
+                dataset,
+                reader,
+                streams: indices,
+                times,
+                clock,
+                units: of_rig,
+                signals,
+                read: 0,
+                after,
+            });
         }
         if sources.is_empty() {
             return Err(bad("name a dataset to replay"));
         }
-        let utc_offset_ns = utc_offset_ns(&mut sources)?;
+        if sources.iter().any(|s| s.clock.is_none()) {
+            for source in &mut sources {
+                source.clock = None;
+                source.times = source.reader.times().to_vec();
+            }
+        }
+        let utc_offset_ns = match &sources[0].clock {
+            Some(clock) => clock.utc_offset_ns,
+            None => utc_offset_ns(&mut sources)?,
+        };
         let rig = match rig {
             Some(rig) => rig,
             None => rig_of(&sources)?,
@@ -122,7 +170,7 @@ impl Sources {
             .map(|s| Part {
                 name: s.dataset.path().display().to_string(),
                 streams: s.streams.iter().map(|i| &self.streams[*i].id).collect(),
-                times: s.reader.times(),
+                times: &s.times,
             })
             .collect();
         Timeline::new(&parts)
@@ -198,8 +246,16 @@ impl Sources {
             let Some(source) = self.list.get_mut(member.dataset as usize) else { continue };
             match source.reader.read(member.set as usize, mode) {
                 Ok(set) => {
-                    let shift_ns = shift(set.utc_offset_ns, self.utc_offset_ns);
-                    take(&mut read, set, source, shift_ns, sets == 0);
+                    if member.set as usize != source.read + 1 {
+                        source.after.fill(None);
+                    }
+                    source.read = member.set as usize;
+                    let place = source.clock.as_ref().and_then(|c| c.places.get(member.set as usize));
+                    let shift = place.map_or_else(
+                        || Shift::of_utc(set.utc_offset_ns, self.utc_offset_ns),
+                        |place| Shift::from(*place),
+                    );
+                    take(&mut read, set, source, shift, sets == 0);
                     sets += 1;
                 }
                 Err(e) => read.problems.push(e.to_string()),
@@ -312,10 +368,43 @@ fn rig_of(sources: &[Source]) -> Result<RigName> {
     }
 }
 
-/// The shift of a time on a clock with `offset_ns` to UTC onto the clock with `base_ns`.
-fn shift(offset_ns: i64, base_ns: i64) -> i64 {
-    let shift = offset_ns.saturating_sub(base_ns);
-    if shift.saturating_abs() < SAME_CLOCK_NS { 0 } else { shift }
+/// How the times of a set are moved onto the clock of the replay.
+#[derive(Debug, Clone, Copy, Default)]
+struct Shift {
+    ns: i64,
+    epoch_ns: i64,
+    uncertainty_ns: u64,
+    is_doubtful: bool,
+}
+
+impl Shift {
+    /// From a clock with `offset_ns` to UTC onto the clock with `base_ns`.
+    fn of_utc(offset_ns: i64, base_ns: i64) -> Self {
+        let ns = offset_ns.saturating_sub(base_ns);
+        let ns = if ns.saturating_abs() < SAME_CLOCK_NS { 0 } else { ns };
+        Self { ns, epoch_ns: ns, ..Self::default() }
+    }
+
+    fn move_header(self, h: &mut FrameHeader) {
+        for t in [&mut h.capture_time_ns, &mut h.arrival_time_ns, &mut h.publish_time_ns] {
+            *t = t.saturating_add(self.ns);
+        }
+        h.capture_uncertainty_ns = h.capture_uncertainty_ns.saturating_add(self.uncertainty_ns);
+        if self.is_doubtful {
+            h.flags |= FrameFlags::TIME_UNCERTAIN.0;
+        }
+    }
+}
+
+impl From<Place> for Shift {
+    fn from(p: Place) -> Self {
+        Self {
+            ns: p.shift_ns,
+            epoch_ns: p.epoch_shift_ns,
+            uncertainty_ns: p.uncertainty_ns,
+            is_doubtful: p.is_doubtful,
+        }
+    }
 }
 
 /// Whether there is a time between the first and the last of both.
@@ -325,13 +414,8 @@ fn overlap(a: &[i64], b: &[i64]) -> bool {
 }
 
 /// Adds a set to a moment.
-fn take(moment: &mut Moment, set: DatasetSet, source: &Source, shift_ns: i64, first: bool) {
-    let move_header = |h: &mut FrameHeader| {
-        for t in [&mut h.capture_time_ns, &mut h.arrival_time_ns, &mut h.publish_time_ns] {
-            *t = t.saturating_add(shift_ns);
-        }
-    };
-    let tick = set.tick.plus_ns(shift_ns);
+fn take(moment: &mut Moment, set: DatasetSet, source: &mut Source, shift: Shift, first: bool) {
+    let tick = set.tick.plus_ns(shift.ns);
     if first {
         (moment.id, moment.tick, moment.spread_ns) = (set.id, tick, set.spread_ns);
     }
@@ -339,19 +423,21 @@ fn take(moment: &mut Moment, set: DatasetSet, source: &Source, shift_ns: i64, fi
     for mut frame in set.frames {
         let Some(stream) = source.streams.get(frame.stream) else { continue };
         frame.stream = *stream;
-        move_header(&mut frame.header);
+        shift.move_header(&mut frame.header);
         moment.frames.push(frame);
     }
     for mut batch in set.motion {
         let Some(unit) = source.units.get(batch.unit).copied().flatten() else { continue };
         batch.unit = unit;
-        move_header(&mut batch.header);
-        batch.samples.iter_mut().for_each(|s| s.time_ns = s.time_ns.saturating_add(shift_ns));
+        shift.move_header(&mut batch.header);
+        batch.samples.iter_mut().for_each(|s| s.time_ns = s.time_ns.saturating_add(shift.ns));
         moment.motion.push(batch);
     }
     for part in set.signals {
         let Some(signal) = source.signals.get(part.signal).copied().flatten() else { continue };
-        let samples = part.samples.iter().filter_map(|s| shifted(s, shift_ns)).collect();
+        let after = &mut source.after[part.signal];
+        let samples =
+            part.samples.iter().filter_map(|s| shifted(s, shift.ns, shift.epoch_ns, after)).collect();
         moment.signals.push(RecordSignal { signal, samples });
     }
 }

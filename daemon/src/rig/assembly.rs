@@ -6,7 +6,7 @@ use super::Inner;
 use super::join::{Held, LateStreams};
 use super::motion::Units;
 use crate::camera::Camera;
-use crate::config::Phase;
+use crate::config::{LinkConfig, LinkRole, Phase};
 use crate::sets::{Assembler, AssemblerConfig, FrameSet, PhasePolicy};
 use crate::status::{CameraState, SetAccount};
 use crate::stream::Stream;
@@ -45,6 +45,8 @@ pub struct Assembly {
     motion: Units,
     next_id: u64,
     incomplete: u64,
+    /// Of the session's clock, when the ticks were last aligned.
+    epoch: Option<u32>,
 }
 
 impl Assembly {
@@ -64,6 +66,7 @@ impl Assembly {
             motion: Units::default(),
             next_id: 1,
             incomplete: 0,
+            epoch: None,
         })
     }
 
@@ -142,10 +145,12 @@ impl Assembly {
         if let Some(ms) = sets.max_wait_ms {
             config.max_wait_ns = (ms * 1e6) as i64;
         }
-        config.phase = match sets.phase {
-            Phase::Auto => PhasePolicy::MinimiseSpread,
-            Phase::Fixed => PhasePolicy::Fixed,
+        config.phase = match (&self.inner.config.link, sets.phase) {
+            (Some(LinkConfig { role: LinkRole::Camera(_), .. }), _) => PhasePolicy::Aligned,
+            (Some(_), _) | (None, Phase::Fixed) => PhasePolicy::Fixed,
+            (None, Phase::Auto) => PhasePolicy::MinimiseSpread,
         };
+        self.epoch = None;
         self.assembler = Some(Assembler::new(config));
     }
 
@@ -178,10 +183,20 @@ impl Assembly {
 
     fn send_sets(&mut self) {
         let now = HostTime::now();
+        self.align(now);
         while let Some(set) = self.assembler.as_mut().and_then(|a| a.poll(now)) {
             self.send(set);
         }
         self.report();
+    }
+
+    /// Puts the ticks on the grid of the session's clock.
+    fn align(&mut self, now: HostTime) {
+        let Some(assembler) = &mut self.assembler else { return };
+        if let Some(clock) = self.inner.link.as_ref().and_then(|link| link.at(now)) {
+            let stepped = self.epoch.replace(clock.epoch) != Some(clock.epoch);
+            assembler.align(clock.offset_ns, stepped);
+        }
     }
 
     fn send(&mut self, set: FrameSet<Frame>) {

@@ -33,6 +33,7 @@ pub fn status(inner: &Inner) -> RigStatus {
         preparing: inner.drawing().map(preparing),
         cameras,
         signals,
+        link: inner.link.as_ref().map(|link| link.status(now)),
         sets: sets(inner),
         recording: recording(inner),
         shared_memory: SharedMemoryStatus {

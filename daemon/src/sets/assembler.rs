@@ -31,6 +31,8 @@ pub struct Assembler<T> {
     settled: bool,
     /// How far the ticks have still to move.
     owed: i64,
+    /// The other host's clock minus this one.
+    offset: i64,
 }
 
 impl<T> Assembler<T> {
@@ -49,10 +51,18 @@ impl<T> Assembler<T> {
             ticks: 0,
             next_id: 1,
             strays: 0,
-            settled: config.phase == PhasePolicy::Fixed,
+            settled: config.phase != PhasePolicy::MinimiseSpread,
             owed: 0,
+            offset: 0,
             config,
         }
+    }
+
+    /// Has ticks lie on multiples of the period of a clock that is `offset_ns` ahead of the host's. They get there by 1 % of a period each,
+    /// or, when `at_once`, with the next one.
+    pub const fn align(&mut self, offset_ns: i64, at_once: bool) {
+        self.offset = offset_ns;
+        self.settled &= !at_once;
     }
 
     /// Takes a frame of a stream. Whatever cannot be in a set any more is dropped before this returns.
@@ -62,9 +72,10 @@ impl<T> Assembler<T> {
             self.strays += 1;
             return;
         };
-        // The first tick is the first multiple of the period at or after the first frame.
+        // The first tick is the first multiple of the period at or after the first frame, on the clock that has the grid.
         let stamp = capture.ns().clamp(-FAR_NS, FAR_NS);
-        let first = || stamp + (period - stamp.rem_euclid(period)) % period;
+        let beyond = stamp.saturating_add(self.offset).rem_euclid(period);
+        let first = || stamp + (period - beyond) % period;
         let tick = *self.tick.get_or_insert_with(first);
         s.push(stamp, item);
         let next = next_at_least(&self.config, self.settled, tick);
@@ -160,7 +171,11 @@ impl<T> Assembler<T> {
     fn advance(&mut self, tick: i64, ticks: i64) {
         self.ticks += 1;
         let next = tick.saturating_add(self.config.period_ns.saturating_mul(ticks));
-        let shift = if self.config.phase == PhasePolicy::MinimiseSpread { self.shift(next) } else { 0 };
+        let shift = match self.config.phase {
+            PhasePolicy::Fixed => 0,
+            PhasePolicy::MinimiseSpread => self.shift(next),
+            PhasePolicy::Aligned => self.grid_shift(next),
+        };
         let tick = next.saturating_add(shift);
         self.tick = Some(tick);
         let after = next_at_least(&self.config, self.settled, tick);
@@ -168,6 +183,16 @@ impl<T> Assembler<T> {
             s.prune(tick, after, self.config.max_pending);
             *account = s.account;
         }
+    }
+
+    /// How far `next` is to be moved now to lie on the grid of the other clock.
+    fn grid_shift(&mut self, next: i64) -> i64 {
+        let period = self.config.period_ns;
+        let beyond = next.saturating_add(self.offset).rem_euclid(period);
+        let owed = if beyond > period / 2 { period - beyond } else { -beyond };
+        let limit = shift_limit(&self.config, self.settled);
+        self.settled = true;
+        owed.clamp(-limit, limit)
     }
 
     /// How far `next` is to be moved now.
@@ -196,6 +221,8 @@ fn shift_limit(config: &AssemblerConfig, settled: bool) -> i64 {
         0
     } else if settled {
         config.period_ns / 100
+    } else if config.phase == PhasePolicy::Aligned {
+        config.period_ns / 2
     } else {
         (slowest(config) / 2 + 1).min(config.period_ns / 2)
     }

@@ -371,3 +371,62 @@ fn no_frame_is_late_or_lost_in_a_quiet_rig() {
         assert!(a.used >= 290);
     }
 }
+
+/// Sets of two streams at 30 Hz for `seconds`, with the clock of the grid ahead by `offset` at each local time.
+fn aligned(seconds: i64, mut offset: impl FnMut(i64) -> (i64, bool)) -> Vec<i64> {
+    let config = AssemblerConfig { phase: PhasePolicy::Aligned, ..fixed(200, &[33, 33]) };
+    let mut assembler: Assembler<()> = Assembler::new(config);
+    let mut ticks = Vec::new();
+    for i in 0..seconds * 30 {
+        let now = i * 33 * MS;
+        let (offset, at_once) = offset(now);
+        assembler.align(offset, at_once);
+        for stream in 0..2 {
+            assembler.push(stream, HostTime::from_ns(now + stream as i64 * 5 * MS), ());
+        }
+        while let Some(set) = assembler.poll(HostTime::from_ns(now + 10 * MS)) {
+            assert!(set.is_complete() || ticks.is_empty(), "{set:?}");
+            ticks.push(set.tick.ns());
+        }
+    }
+    assert!(ticks.windows(2).all(|w| w[1] > w[0]));
+    ticks
+}
+
+/// How far a time of the clock of the grid is from it.
+fn from_grid(time: i64) -> i64 {
+    let beyond = time.rem_euclid(200 * MS);
+    beyond.min(200 * MS - beyond)
+}
+
+#[test]
+fn ticks_lie_on_the_grid_of_the_other_clock() {
+    for offset in [0, 77 * MS, -123_456_789_012_345, 86_400_000 * MS + 1] {
+        // It drifts by 100 ppm: in a period, by which the tick is known ahead, 20 us.
+        let drifting = |now: i64| offset + now / 10_000;
+        let ticks = aligned(20, |now| (drifting(now), false));
+        assert!(ticks.len() > 90);
+        for tick in ticks {
+            assert!(from_grid(tick + drifting(tick)) <= 30_000, "{offset}: {tick}");
+        }
+    }
+}
+
+#[test]
+fn a_clock_that_is_known_late_or_steps_moves_the_ticks_at_once() {
+    let step_at = 5_000 * MS;
+    let stepped = |now: i64| if now < step_at { 0 } else { 60 * MS };
+    let mut before = 0;
+    let ticks = aligned(12, |now| {
+        let offset = stepped(now);
+        let at_once = offset != before;
+        before = offset;
+        (offset, at_once)
+    });
+    let wrong = ticks.iter().filter(|t| from_grid(**t + stepped(**t)) != 0).count();
+    assert!(wrong <= 2, "{wrong}");
+    // Without that it takes its time, and sets stay as far apart as before.
+    let slow = aligned(12, |now| (stepped(now), false));
+    assert!(slow.windows(2).all(|w| (w[1] - w[0] - 200 * MS).abs() <= 2 * MS));
+    assert_eq!(from_grid(slow.last().unwrap() + 60 * MS), 0);
+}

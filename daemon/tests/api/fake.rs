@@ -5,9 +5,9 @@ use depthrig_daemon::control::{
     ReplayControl, SeekRequest, UncertaintyOfImage,
 };
 use depthrig_daemon::status::{
-    CameraState, CameraStatus, ClockStatus, PreparingStatus, RecordingStatus, RefineState, RefineStatus,
-    ReplayStatus, RigStatus, SetAccount, SetStatus, SharedMemoryStatus, SignalState, SignalStatus,
-    StreamStatus,
+    CameraState, CameraStatus, ClockStatus, LinkState, LinkStatus, PreparingStatus, RecordingStatus,
+    RefineState, RefineStatus, ReplayStatus, RigStatus, SetAccount, SetStatus, SharedMemoryStatus,
+    SignalState, SignalStatus, StreamStatus,
 };
 use depthrig_daemon::{Error, ErrorKind, Result};
 use depthrig_recorder::Episode;
@@ -155,6 +155,19 @@ impl Fake {
                 samples: 3000,
                 missed: 2,
             }],
+            link: Some(LinkStatus {
+                host: "left".into(),
+                recorder: Some("10.0.0.1:7447".into()),
+                state: LinkState::Live,
+                offset_s: Some(1234.5),
+                uncertainty_us: Some(27.0),
+                rate_ppm: Some(-3.5),
+                epoch: Some(1),
+                round_trip_us: Some(180.0),
+                age_s: Some(0.01),
+                exchanges: 100,
+                refused: 0,
+            }),
             cameras: vec![
                 camera("d435", CameraState::Streaming, None),
                 camera("d405", CameraState::Reconnecting, Some("unplugged")),

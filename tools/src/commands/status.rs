@@ -7,11 +7,11 @@ use crate::view::{self, Style};
 use crate::{out, screen};
 use anyhow::Result;
 use core::time::Duration;
-use depthrig_daemon::status::{CameraState, CameraStatus, RefineState, RigStatus, SignalState};
+use depthrig_daemon::status::{CameraState, CameraStatus, LinkState, RefineState, RigStatus, SignalState};
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-Exit code 3 if a camera is not streaming, a required signal does not come, depth that should be refined is not, or the recording lost anything.
+Exit code 3 if a camera is not streaming, a required signal does not come, the clock of the session does not answer, depth that should be refined is not, or the recording lost anything.
 
 Examples:
   depthrig status
@@ -55,7 +55,13 @@ fn exit(rig: &RigStatus) -> Exit {
         rig.recording.as_ref().is_some_and(|r| r.error.is_some() || r.dropped.values().any(|n| *n > 0));
     let refined = |c: &CameraStatus| c.refine.as_ref().is_none_or(|r| r.state != RefineState::Failed);
     let silent = rig.signals.iter().any(|s| s.required && s.state != SignalState::Live);
-    if lost || silent || !rig.cameras.iter().all(refined) || !rig.cameras.iter().all(|c| fine(c.state)) {
+    let adrift = rig.link.as_ref().is_some_and(|l| matches!(l.state, LinkState::Silent | LinkState::Unknown));
+    if lost
+        || silent
+        || adrift
+        || !rig.cameras.iter().all(refined)
+        || !rig.cameras.iter().all(|c| fine(c.state))
+    {
         Exit::Lost
     } else {
         Exit::Good

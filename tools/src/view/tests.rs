@@ -68,6 +68,7 @@ fn rig() -> RigStatus {
         cpu_cores: 0.5,
         replay: None,
         signals: Vec::new(),
+        link: None,
     }
 }
 
@@ -186,4 +187,35 @@ fn color_marks_what_is_wrong_and_clipping_keeps_it_whole() {
     let bad = text.lines().find(|l| l.contains("l515/depth  ")).unwrap();
     assert!(bad.starts_with(YELLOW) && bad.ends_with(RESET));
     assert_eq!(clip("\x1b[31mabcdef\x1b[0m", 3), "\x1b[31mabc\x1b[0m");
+}
+
+#[test]
+fn the_clock_of_the_session_has_a_line_and_a_cure_if_it_does_not_answer() {
+    let known = LinkStatus {
+        host: "left".into(),
+        recorder: Some("10.0.0.1:7447".into()),
+        state: LinkState::Live,
+        offset_s: Some(-1_234.567_890_1),
+        uncertainty_us: Some(21.4),
+        rate_ppm: Some(3.0),
+        epoch: Some(1),
+        round_trip_us: Some(40.0),
+        age_s: Some(12.4),
+        exchanges: 7,
+        refused: 0,
+    };
+    let shown = |link: LinkStatus| {
+        let text = status(&RigStatus { link: Some(link), ..rig() }, Style { width: 80, color: false });
+        assert!(text.lines().all(|line| line.chars().count() <= 80), "{text}");
+        text
+    };
+    let live = shown(known.clone());
+    assert!(live.contains("link    left: 10.0.0.1:7447 is -1234.567890 s, within 21 us\n"), "{live}");
+    assert!(!live.contains("firewall"));
+    let silent = shown(LinkStatus { state: LinkState::Silent, ..known.clone() });
+    assert!(silent.contains("within 21 us, silent for 12 s\n") && silent.contains("firewall"), "{silent}");
+    let unknown = shown(LinkStatus { state: LinkState::Unknown, offset_s: None, ..known.clone() });
+    assert!(unknown.contains("10.0.0.1:7447 does not answer") && !unknown.contains("within"), "{unknown}");
+    let own = shown(LinkStatus { recorder: None, state: LinkState::Own, ..known });
+    assert!(own.contains("link    left: the clock of the session is here, 7 questions answered"), "{own}");
 }

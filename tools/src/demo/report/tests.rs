@@ -105,6 +105,7 @@ fn status() -> RigStatus {
         shared_memory: depthrig_daemon::status::SharedMemoryStatus::default(),
         cpu_cores: 0.0,
         replay: None,
+        link: None,
         signals: Vec::new(),
     }
 }
