@@ -10,6 +10,7 @@ mod clock;
 mod disk;
 mod finding;
 mod host;
+mod link;
 mod memory;
 mod plan;
 mod refine;

@@ -3,11 +3,12 @@
 use super::clock::{ClockSync, clock_sync};
 use super::disk::DiskFacts;
 use super::finding::{Finding, Severity};
-use super::{CameraPlan, Surroundings};
+use super::{CameraPlan, Surroundings, link};
 use crate::config::{CameraConfig, RigConfig};
 use crate::family::Unmet;
 use crate::priority;
 use crate::recording::reserve_bytes;
+use crate::status::LinkStatus;
 use depthrig_bus::shm;
 use depthrig_usb::SysRoot;
 use std::path::Path;
@@ -25,6 +26,8 @@ pub struct Host {
     pub clock: Option<ClockSync>,
     /// Who runs a rig of this name now.
     pub rig_holder: Option<String>,
+    /// The clock of a session of several computers, or why it cannot be had; `None` for one computer.
+    pub link: Option<Result<LinkStatus, String>>,
     /// The disk of the recordings.
     pub disk: DiskFacts,
     /// Requirements of the cameras that it does not meet.
@@ -41,12 +44,16 @@ impl Host {
         let shm_folder = around.root.at(Path::new(shm::SHM_DIR));
         let mut recorded = plans.flat_map(|p| &p.profiles).map(|(_, recorded)| *recorded);
         let measure = around.measure_disk && recorded.any(|r| r);
+        let rig_holder = around.runtime.as_ref().and_then(|r| r.holder(&config.rig));
+        // The rig that runs has the address.
+        let link = config.link.as_ref().filter(|_| rig_holder.is_none()).map(link::ask);
         Self {
             root: around.root.clone(),
+            link,
             shm_free_bytes: shm::free_bytes(&shm_folder).ok(),
             realtime_refusal: priority::refusal(),
             clock: clock_sync(),
-            rig_holder: around.runtime.as_ref().and_then(|r| r.holder(&config.rig)),
+            rig_holder,
             disk: DiskFacts::gather(&config.recording.directory, reserve_bytes(&config.recording), measure),
             unmet: unmet(config),
         }
@@ -82,6 +89,9 @@ impl Host {
                 "allow it: `@video - rtprio 20` in /etc/security/limits.d/depthrig.conf and log in again, or LimitRTPRIO=20 \
                  in a service (depthrig install has one); or set supervisor.raise_priority = false",
             ));
+        }
+        if let Some(link) = &self.link {
+            link::check(link, findings);
         }
         if self.clock.is_some_and(|c| !c.synchronised) {
             findings.push(Finding::new(

@@ -37,6 +37,7 @@ fn well(root: SysRoot) -> Host {
         shm_free_bytes: Some(64 << 30),
         realtime_refusal: None,
         clock: Some(ClockSync { synchronised: true, max_error_us: 900 }),
+        link: None,
         rig_holder: None,
         disk: DiskFacts {
             folder: PathBuf::from("/data"),
@@ -594,4 +595,32 @@ fn two_kinects_need_more_memory_for_transfers_than_the_kernel_gives() {
     };
     assert_eq!(found(&plans[..1]), "");
     assert!(found(&plans).contains("32 MB are needed"), "{}", found(&plans));
+}
+
+#[test]
+fn the_clock_of_the_session_is_asked_for_before_a_session() {
+    use crate::config::{LinkConfig, LinkRole};
+    let link = |role| LinkConfig { host: "left".parse().unwrap(), role };
+    let found = |role| {
+        let asked = super::link::ask(&link(role));
+        let report = host_report(FILES, |h| h.link = Some(asked));
+        (ids(&report), all_text(&report.findings))
+    };
+    let recorder = depthrig_link::Answerer::start("127.0.0.1:0".parse().unwrap()).unwrap();
+    let (ids, text) = found(LinkRole::Camera(recorder.address()));
+    // A busy computer may give a loose bound.
+    assert!(
+        matches!(ids.as_slice(), [("link_clock", Severity::Info) | ("link_loose", Severity::Warning)]),
+        "{text}"
+    );
+    let (ids, _) = found(LinkRole::Recorder("127.0.0.1:0".parse().unwrap()));
+    assert_eq!(ids, []);
+    let (ids, text) = found(LinkRole::Recorder(recorder.address()));
+    assert_eq!(ids, [("link_address", Severity::Error)]);
+    assert!(text.contains("cannot be listened on"), "{text}");
+    let address = recorder.address();
+    drop(recorder);
+    let (ids, text) = found(LinkRole::Camera(address));
+    assert_eq!(ids, [("link_silent", Severity::Error)]);
+    assert!(text.contains("let its firewall pass UDP"), "{text}");
 }
