@@ -259,9 +259,13 @@ def test_the_panel_lists_the_episodes_and_judges_earlier_ones(
             until(lambda page=page: page.page.locator(".episode-row[data-state=success]").count() == 2)
         save_screenshot(wall, "episodes-panel")
         wall.page.click('.episode-row[data-number="1"] button:has-text("Discard")')
-        # The other page has it, too, though no status has it.
         for page in (wall, other):
             page.wait_for_state('.episode-row[data-number="1"]', "discarded")
+        wall.page.click('.episode-row[data-number="1"] button:has-text("Success")')
+        other.wait_for_state('.episode-row[data-number="1"]', "success")
+        # The other page has it, too, though the status has neither its count nor this episode.
+        wall.page.click('.episode-row[data-number="1"] button:has-text("Failure")')
+        other.wait_for_state('.episode-row[data-number="1"]', "failure")
         wall.page.click('.episode-row[data-number="1"] button:has-text("No judgement")')
         wall.wait_for_state('.episode-row[data-number="1"]', "kept")
         wall.page.keyboard.press("j")
