@@ -2,7 +2,7 @@
 
 import { socketAddress } from "./dataset.js";
 import { CLOSED, PROTOCOL, parseImage, parseText } from "./protocol.js";
-import { creditMessage, pixelMessage, replayMessage, tokenMessage, watchMessage } from "./protocol.js";
+import { creditMessage, pixelMessage, replayMessage, signalsMessage, tokenMessage, watchMessage } from "./protocol.js";
 
 /** @typedef {import("./types.js").Hello} Hello */
 /** @typedef {import("./types.js").Status} Status */
@@ -21,6 +21,7 @@ import { creditMessage, pixelMessage, replayMessage, tokenMessage, watchMessage 
  * @property {(answer: PixelAnswer) => void} onPixel
  * @property {(geometry: Geometry) => void} onGeometry
  * @property {(measure: Measure) => void} onMeasure
+ * @property {(news: import("./types.js").SignalsNews) => void} onSignals
  * @property {(message: string) => void} onProblem
  */
 
@@ -102,6 +103,17 @@ export class Connection {
   }
 
   /**
+   * @param {import("./types.js").ShownSignal[] | null} shown
+   * @returns {boolean} whether it was sent
+   */
+  askSignals(shown) {
+    if (this.#isLive) {
+      this.#send(signalsMessage(shown));
+    }
+    return this.#isLive;
+  }
+
+  /**
    * Steers the dataset that is shown.
    *
    * @param {string} command
@@ -160,6 +172,8 @@ export class Connection {
       this.#listener.onGeometry(message.geometry);
     } else if ("measure" in message) {
       this.#listener.onMeasure(message.measure);
+    } else if ("signals" in message) {
+      this.#listener.onSignals(message.signals);
     } else {
       this.#listener.onProblem(message.problem.message);
     }

@@ -100,7 +100,8 @@ export function releaseFocusAfterClicks() {
     if (isPointer && focused instanceof HTMLElement && focused.matches("button, input[type=checkbox]")) {
       focused.blur();
     }
-  });
+    // Before the button acts: a panel or a dialog that it opens gives the focus back when it is closed.
+  }, { capture: true });
 }
 
 /**

@@ -12,6 +12,7 @@
  * @property {boolean} isInDialog
  *
  * @typedef {{action: "toggleRecord" | "note" | "back" | "help" | "enlarge" | "playPause" | "cloud" | "aids" | "reference"}
+ *   | {action: "episode" | "success" | "failure" | "discard" | "task"}
  *   | {action: "redo" | "bad" | "good" | "mark"} | {action: "panel", panel: PanelName}
  *   | {action: "step", sets: number} | {action: "camera", n: number}} KeyAction
  */
@@ -24,6 +25,11 @@ const LETTERS = {
   b: { action: "bad" },
   g: { action: "good" },
   m: { action: "mark" },
+  e: { action: "episode" },
+  s: { action: "success" },
+  f: { action: "failure" },
+  x: { action: "discard" },
+  t: { action: "task" },
   v: { action: "cloud" },
   a: { action: "aids" },
   o: { action: "reference" },
@@ -32,6 +38,8 @@ const LETTERS = {
   d: { action: "panel", panel: "doctor" },
   c: { action: "panel", panel: "controls" },
   k: { action: "panel", panel: "calibration" },
+  i: { action: "panel", panel: "signals" },
+  j: { action: "panel", panel: "episodes" },
 };
 const TEXT_INPUTS = ["text", "search", "number", "email", "url", "password", "tel"];
 

@@ -6,6 +6,7 @@ import { CloudView } from "./cloudview.js";
 import { Connection } from "./connection.js";
 import { addressOf, datasetOf } from "./dataset.js";
 import { announce, byId, releaseFocusAfterClicks, setState, setText } from "./dom.js";
+import { EpisodeBar } from "./episodebar.js";
 import { Hover } from "./hover.js";
 import { actionOf, keyTarget } from "./keys.js";
 import { TileLabels } from "./labels.js";
@@ -100,12 +101,17 @@ const cloud = new CloudView({
 Object.assign(debug, { view: cloud.facts, aids });
 const labels = new TileLabels(wall);
 const hover = new Hover(wall.tiles, (id, place) => connection.askPixel(id, place));
-const recordBar = new RecordBar();
+/** @type {import("./episodespanel.js").EpisodesPanel | null} `null` before its panel is opened first */
+let episodes = null;
+const episodeBar = new EpisodeBar(() => episodes?.look());
+const recordBar = new RecordBar((next) => episodeBar.update(next));
 const hasReference = byId("show-reference", HTMLButtonElement);
 /** @type {import("./reference.js").Reference | null} `null` before it is asked for first */
 let reference = null;
 /** @type {import("./recordings.js").Recordings | null} `null` before its panel is opened first */
 let recordings = null;
+/** @type {import("./signalspanel.js").SignalsPanel | null} `null` before its panel is opened first */
+let signals = null;
 const takes = new Takes(recordBar, (entry) => recordings?.marked(entry));
 const replayBar = new ReplayBar(
   (command, body) => connection.steer(command, body),
@@ -122,6 +128,15 @@ const panels = new Panels({
   calibration: {
     title: "Calibration",
     load: async () => new (await import("./calibrationpanel.js")).CalibrationPanel(wall.tiles),
+  },
+  signals: {
+    title: "Signals",
+    load: async () =>
+      (signals = new (await import("./signalspanel.js")).SignalsPanel((shown) => connection.askSignals(shown))),
+  },
+  episodes: {
+    title: "Episodes",
+    load: async () => (episodes = new (await import("./episodespanel.js")).EpisodesPanel()),
   },
 });
 const liveStatus = new LiveStatus(showLiveStatus);
@@ -141,6 +156,7 @@ const connection = new Connection({
     cloud.redraw();
   },
   onMeasure: (measure) => aids.measured(measure),
+  onSignals: (news) => signals?.answer(news),
   onProblem: showProblem,
 });
 
@@ -156,8 +172,10 @@ function showConnection(state, text) {
   setState(box, state);
   setText(box, text);
   recordBar.setLive(state === "live");
+  episodeBar.setLive(state === "live");
   if (state === "live") {
     wall.reconnect();
+    signals?.reconnected();
   } else {
     hover.hide();
   }
@@ -321,6 +339,15 @@ function act(action) {
       return takes.good();
     case "mark":
       return void takes.mark();
+    case "episode":
+      return episodeBar.toggle();
+    case "success":
+    case "failure":
+      return episodeBar.judge(action.action);
+    case "discard":
+      return episodeBar.discard();
+    case "task":
+      return episodeBar.focusTask();
     case "help":
       return byId("help", HTMLDialogElement).showModal();
     case "cloud":
@@ -331,13 +358,13 @@ function act(action) {
       return void showReference();
     case "camera":
       cloud.close();
-      return wall.enlargeCamera(action.n);
+      return wall.enlargeCamera(action.n) ? undefined : showProblem(`There is no camera ${action.n}.`);
     case "enlarge": {
       const tile = focusedTile();
       return tile === undefined ? undefined : wall.enlarge(tile);
     }
     case "playPause":
-      return replayBar.isShown ? replayBar.togglePause() : undefined;
+      return replayBar.isShown ? replayBar.togglePause() : showProblem("P pauses a replay, and this is none.");
     case "step":
       return replayBar.isShown ? replayBar.step(action.sets) : undefined;
   }
@@ -353,6 +380,7 @@ function focusedTile() {
 /** Aids go with an enlarged image: without one, the tile that has the focus or the first is enlarged. */
 function showAids() {
   if (cloud.isOpen) {
+    showProblem("Aids go with an enlarged image; Esc closes the 3-D view.");
     return;
   }
   if (wall.enlarged !== null) {
@@ -360,17 +388,20 @@ function showAids() {
     return;
   }
   const tile = focusedTile() ?? [...wall.tiles.values()][0];
-  if (tile !== undefined) {
-    wall.enlarge(tile);
-    if (!aids.isOpen) {
-      aids.toggle();
-    }
+  if (tile === undefined) {
+    showProblem("Aids go with an image, and none is shown yet.");
+    return;
+  }
+  wall.enlarge(tile);
+  if (!aids.isOpen) {
+    aids.toggle();
   }
 }
 
 /** A reference goes with an enlarged image of colour or infrared, too. */
 async function showReference() {
   if (cloud.isOpen) {
+    showProblem("A reference goes with an enlarged image; Esc closes the 3-D view.");
     return;
   }
   if (wall.enlarged === null) {

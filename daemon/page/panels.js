@@ -5,7 +5,7 @@
 
 import { announce, byId, makeText, setText } from "./dom.js";
 
-/** @typedef {"recordings" | "sync" | "doctor" | "controls" | "calibration"} PanelName */
+/** @typedef {"recordings" | "sync" | "doctor" | "controls" | "calibration" | "signals" | "episodes"} PanelName */
 
 /** @typedef {{title: string, load: () => Promise<Panel>}} PanelPlace */
 

@@ -26,7 +26,7 @@ const KIND_JPEG = 1;
 const KIND_DEPTH = 2;
 const BYTES_PER_DEPTH = 2;
 const NS_PER_MS = 1e6;
-const KNOWN = ["hello", "status", "pixel", "problem", "geometry", "measure"];
+const KNOWN = ["hello", "status", "pixel", "problem", "geometry", "measure", "signals"];
 
 /**
  * Reads a binary message.
@@ -92,7 +92,7 @@ export function jpegOf(image) {
 
 /**
  * @typedef {{hello: Hello} | {status: Status} | {pixel: PixelAnswer} | {problem: {message: string}}
- *   | {geometry: Geometry} | {measure: Measure}} ServerMessage
+ *   | {geometry: Geometry} | {measure: Measure} | {signals: import("./types.js").SignalsNews}} ServerMessage
  */
 
 /**
@@ -130,6 +130,15 @@ export function creditMessage() {
  */
 export function pixelMessage(id, place) {
   return JSON.stringify({ pixel: { id, stream: place.stream, x: place.x, y: place.y } });
+}
+
+/**
+ * Asks for what is new of these signals; `null`: none is shown any more.
+ *
+ * @param {import("./types.js").ShownSignal[] | null} shown
+ */
+export function signalsMessage(shown) {
+  return JSON.stringify({ signals: shown });
 }
 
 /**

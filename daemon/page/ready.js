@@ -46,6 +46,7 @@ export function readiness(status, doctor) {
   /** @type {string[]} */
   const good = [];
   streams(status, { bad, odd, good });
+  signals(status, { bad });
   room(status, doctor, { bad, odd, good });
   spread(status, { odd, good });
   if (doctor !== null) {
@@ -83,6 +84,17 @@ function streams(status, { bad, odd, good }) {
     odd.push("the simulated scenes are still rendered");
   }
   good.push(`${images.length - silent.length} streams`);
+}
+
+/**
+ * @param {Status} status
+ * @param {{bad: string[]}} lists
+ */
+function signals(status, { bad }) {
+  const faults = (status.signals ?? []).filter(({ required, state }) => required && state !== "live");
+  if (faults.length > 0) {
+    bad.push(`${some(faults.map(({ signal, state }) => `${signal} (${state})`))}: no samples (I)`);
+  }
 }
 
 /**

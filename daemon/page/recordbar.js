@@ -19,7 +19,8 @@ const COUNTDOWN_KEY = "depthrig-countdown";
 const LOSS_SOUND_MS = 2000;
 /** An older status may come so long after an answer; a clock that is set back must not stop the bar for longer. */
 const ANSWER_MS = 3000;
-const NO_CONNECTION = "Not done: this page has no connection to the daemon.";
+const NOT_DONE = "Not done: ";
+const NO_CONNECTION = `${NOT_DONE}this page has no connection to the daemon.`;
 
 /** @type {Record<RecordState, string>} */
 const STATE_TEXT = { idle: "Idle", recording: "Recording", closing: "Closing" };
@@ -57,6 +58,7 @@ export class RecordBar {
   #lossTime = null;
   #toldError = "";
   #isLive = false;
+  #onStatus;
   /** Whether the page shows the live rig, and no dataset. */
   #isLiveRig = true;
   /** @type {import("./paneltypes.js").DoctorReport | null} */
@@ -69,7 +71,9 @@ export class RecordBar {
     },
   );
 
-  constructor() {
+  /** @param {(status: Status) => void} onStatus each status that is no older than what this page knows of the recording */
+  constructor(onStatus) {
+    this.#onStatus = onStatus;
     this.#seconds.value = stored(COUNTDOWN_KEY) ?? "0";
     if (this.#seconds.selectedIndex < 0) {
       this.#seconds.value = "0";
@@ -103,13 +107,11 @@ export class RecordBar {
     if (this.cancelCountdown()) {
       return;
     }
-    if (!this.#isLive) {
+    const why = this.#whyNot();
+    if (why !== "") {
       // Who presses a pedal looks at the robot.
-      setText(this.#error, NO_CONNECTION);
+      setText(this.#error, why);
       play("error");
-      return;
-    }
-    if (!this.#isReady) {
       return;
     }
     if (this.#shown === "recording") {
@@ -163,7 +165,21 @@ export class RecordBar {
 
   /** Whether a start or a stop can be asked for. */
   get #isReady() {
-    return this.#isLive && this.#request === null && (this.#shown === "idle" || this.#shown === "recording");
+    return this.#whyNot() === "";
+  }
+
+  /** Why neither can be asked for; empty if one can. */
+  #whyNot() {
+    if (!this.#isLive) {
+      return NO_CONNECTION;
+    }
+    if (this.#shown === null) {
+      return `${NOT_DONE}the daemon has not yet said whether it records.`;
+    }
+    if (this.#request === "start") {
+      return `${NOT_DONE}the recording is being started.`;
+    }
+    return this.#request === "stop" || this.#shown === "closing" ? `${NOT_DONE}the last recording is being closed.` : "";
   }
 
   focusNotes() {
@@ -218,6 +234,7 @@ export class RecordBar {
     if (answer !== null && isOlder(answer, status)) {
       return;
     }
+    this.#onStatus(status);
     const facts = this.#watch.follow(status, this.#request === "stop");
     const { recording } = status;
     this.#setState(facts.state);
@@ -279,6 +296,9 @@ export class RecordBar {
       this.cancelCountdown();
     }
     if (before !== state) {
+      if (this.#error.textContent?.startsWith(NOT_DONE)) {
+        setText(this.#error, "");
+      }
       setState(this.#bar, state);
       setState(this.#state, state);
       setText(this.#state, STATE_TEXT[state]);

@@ -52,6 +52,44 @@
  * @property {number} disk_free_bytes
  * @property {number | null} disk_seconds_left
  * @property {string | null} [warning]
+ * @property {number} [episodes] kept ones that have ended
+ * @property {number} [episodes_discarded]
+ * @property {Episode | null} [episode] that runs, or the last one
+ *
+ * @typedef {Object} Episode
+ * @property {number} number from 1
+ * @property {string} task
+ * @property {number} start_utc_ns
+ * @property {number} [end_utc_ns] missing while it runs
+ * @property {"success" | "failure"} [outcome]
+ * @property {boolean} [discarded]
+ *
+ * @typedef {{path: string, episodes: Episode[]}} RecordingEpisodes of `GET /v1/episodes`
+ *
+ * @typedef {Object} SignalStatus
+ * @property {string} signal its name, `DEVICE/SIGNAL`
+ * @property {boolean} required
+ * @property {"live" | "silent" | "missing"} state
+ * @property {number | null} age_s
+ * @property {number} samples
+ * @property {number} missed
+ *
+ * @typedef {{name: string, type: "f64" | "f32" | "i64" | "bool" | "text", count?: number, unit?: string}} SignalField
+ * @typedef {number | boolean | string | null} SignalElement `null` is not a number
+ * @typedef {{number: number, ms: number, gap: boolean, values: (number | null)[]}} SignalPoint of each line of a plot
+ *
+ * @typedef {Object} SignalNews
+ * @property {string} signal its name
+ * @property {string | null} problem why it cannot be read
+ * @property {SignalField[]} fields
+ * @property {SignalElement[][]} values of each field, the first of all
+ * @property {number | null} age_s
+ * @property {number | null} rate_hz
+ * @property {number} restarts
+ * @property {SignalPoint[]} points that the page lacks
+ *
+ * @typedef {{signal: string, after: number}} ShownSignal `after` is the number of the last point that the page has
+ * @typedef {{published: string[], signals: SignalNews[]}} SignalsNews
  *
  * @typedef {Object} LossBucket
  * @property {number} from_s after the beginning of the recording
@@ -93,6 +131,7 @@
  * @property {number} utc_ns
  * @property {{share: number, error: string | null} | null} preparing
  * @property {CameraStatus[]} cameras
+ * @property {SignalStatus[]} [signals]
  * @property {SetStatus} sets
  * @property {RecordingStatus | null} recording
  * @property {number} cpu_cores

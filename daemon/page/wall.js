@@ -239,6 +239,7 @@ export class Wall {
    * Enlarges the n-th camera; its next stream if it is enlarged already.
    *
    * @param {number} n from 1
+   * @returns {boolean} whether there is one
    */
   enlargeCamera(n) {
     const names = [...new Set([...this.tiles.values()].map((tile) => tile.camera))];
@@ -247,6 +248,7 @@ export class Wall {
       const index = this.enlarged === null ? -1 : own.indexOf(this.enlarged);
       this.enlarge(own[(index + 1) % own.length]);
     }
+    return own.length > 0;
   }
 
   #fit() {

@@ -112,6 +112,11 @@ pub trait Control: Send + Sync {
     /// task that is too long.
     fn episode(&self, request: &EpisodeRequest) -> Result<Episode>;
 
+    /// Episodes of the recording in progress, or of the last one; `None` before the first.
+    fn episodes(&self) -> Option<RecordingEpisodes> {
+        None
+    }
+
     /// When the recording in progress, or the last one, lost something; `None` before the first.
     fn record_losses(&self) -> Option<RecordingLosses> {
         None
@@ -394,6 +399,15 @@ pub enum EpisodeRequest {
         #[serde(default)]
         number: Option<u32>,
     },
+}
+
+/// The episodes of a recording.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RecordingEpisodes {
+    /// The dataset's folder.
+    pub path: String,
+    /// They, by number.
+    pub episodes: Vec<Episode>,
 }
 
 /// Options of a recording.

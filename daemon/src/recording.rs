@@ -1,7 +1,7 @@
 //! Recording under control of the daemon: start, stop, notes, and the numbers that go with it.
 
 use crate::config::{RecordingConfig, RigConfig, SignalConfig};
-use crate::control::{EpisodeRequest, LiveRig, RecordRequest};
+use crate::control::{EpisodeRequest, LiveRig, RecordRequest, RecordingEpisodes};
 use crate::losses::{LossHistory, Losses, RecordingLosses};
 use crate::status::{RecordingStatus, SetAccount, SignalStatus};
 use crate::stream::Stream;
@@ -42,6 +42,8 @@ pub struct Recording {
     summary: Option<Summary>,
     /// When the last recording, or the one that goes on, lost something.
     losses: LossHistory,
+    /// Episodes of the last recording, when it has ended.
+    episodes: Vec<Episode>,
     /// Accounts of IMU batches, recorded or not.
     motion: motion::Books,
     /// The signals that are published.
@@ -377,6 +379,7 @@ impl Recording {
         }
         self.refresh();
         let mut active = self.active.take().ok_or_else(none_active)?;
+        self.episodes = active.recorder.episodes();
         self.motion.end(&mut active.motion);
         active.hand_over_accounts();
         if let Some(last) = &mut self.last {
@@ -416,6 +419,16 @@ impl Recording {
         let last = self.last.as_ref()?;
         let (bucket_s, buckets) = self.losses.buckets();
         Some(RecordingLosses { path: last.path.clone(), duration_s: last.duration_s, bucket_s, buckets })
+    }
+
+    /// Episodes of the recording in progress, or of the last one.
+    pub fn episodes(&self) -> Option<RecordingEpisodes> {
+        let path = self.last.as_ref()?.path.clone();
+        let episodes = match &self.active {
+            Some(active) => active.recorder.episodes(),
+            None => self.episodes.clone(),
+        };
+        Some(RecordingEpisodes { path, episodes })
     }
 
     /// Summary of the last finished recording.

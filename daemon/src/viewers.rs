@@ -7,6 +7,7 @@
 mod geometry;
 mod newest;
 mod pixel;
+mod signals;
 mod thread;
 mod worker;
 
@@ -20,6 +21,7 @@ use hyper::body::Bytes;
 pub(crate) use newest::{Newest, next_turn};
 pub(crate) use pixel::{PixelAnswer, PixelQuestion};
 use serde::Serialize;
+pub(crate) use signals::{News, Shown as ShownSignal, SignalFeed, SignalPlace};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Condvar, Mutex};
 pub(crate) use thread::work_until_done;

@@ -158,18 +158,19 @@ fn every_answer_of_a_live_server_fits_the_document() {
         document.check_answer(method, path, answer.status, &answer.media_type(), &answer.body);
         seen.insert((method.to_owned(), path.to_owned()));
     };
-    check("GET", "/v1/record", &served.get("/v1/record"), 200);
-    assert_eq!(served.get("/v1/record").json(), Value::Null);
-    check("GET", "/v1/record/losses", &served.get("/v1/record/losses"), 200);
-    assert_eq!(served.get("/v1/record/losses").json(), Value::Null);
+    for path in ["/v1/record", "/v1/record/losses", "/v1/episodes"] {
+        check("GET", path, &served.get(path), 200);
+        assert_eq!(served.get(path).json(), Value::Null);
+    }
     check("GET", "/v1/status", &served.get("/v1/status"), 200);
     check("POST", "/v1/record/stop", &served.post("/v1/record/stop", ""), 409);
     check("POST", "/v1/record/note", &served.post("/v1/record/note", r#"{"text": "x"}"#), 409);
     check("POST", "/v1/record/start", &served.post("/v1/record/start", r#"{"scene": "table"}"#), 200);
     check("POST", "/v1/record/start", &served.post("/v1/record/start", "{}"), 409);
     check("GET", "/v1/status", &served.get("/v1/status"), 200);
-    check("GET", "/v1/record", &served.get("/v1/record"), 200);
-    check("GET", "/v1/record/losses", &served.get("/v1/record/losses"), 200);
+    for path in ["/v1/record", "/v1/record/losses", "/v1/episodes"] {
+        check("GET", path, &served.get(path), 200);
+    }
     check("POST", "/v1/record/note", &served.post("/v1/record/note", r#"{"text": "lamp on"}"#), 204);
     check("POST", "/v1/record/note", &served.post("/v1/record/note", r#"{"text": ""}"#), 400);
     for (body, status) in EPISODES {
@@ -353,6 +354,7 @@ fn what_is_asked_arrives() {
         force: true,
     };
     assert_eq!(served.fake.last_request(), Some(request));
+    assert_eq!(served.get("/v1/episodes").json()["episodes"][0]["outcome"], "failure");
     assert_eq!(served.get("/v1/config").body, fake::CONFIG);
     assert!(served.get("/metrics").body.contains("depthrig_sets_sent_total 7\n"));
     let health = served.get("/v1/health").json();

@@ -440,6 +440,11 @@ impl Recorder {
         })
     }
 
+    /// Its episodes so far.
+    pub fn episodes(&self) -> Vec<Episode> {
+        self.shared.lock().session.episodes.clone()
+    }
+
     /// Changes an episode; the change is in `session.toml` within the second.
     fn change_episode(&self, change: impl FnOnce(&mut Session, i64) -> Result<Episode>) -> Result<Episode> {
         let mut state = self.shared.lock();

@@ -150,12 +150,19 @@ def address(binary: str, runtime: Path, rig: str) -> Address:
     return Address(found[0])
 
 
-def until(condition: Callable[[], Any], what: Callable[[], Any] = lambda: "") -> Any:
-    """What `condition` returns, as soon as it is true."""
+PAUSE_S = 0.05
+
+
+def until(
+    condition: Callable[[], Any],
+    what: Callable[[], Any] = lambda: "",
+    pause: Callable[[], None] = lambda: time.sleep(PAUSE_S),
+) -> Any:
+    """What `condition` returns, as soon as it is true. For what events of the browser bring use `Wall.until`."""
     deadline = time.monotonic() + WAIT_S
     while not (value := condition()):
         assert time.monotonic() < deadline, what()
-        time.sleep(0.05)
+        pause()
     return value
 
 
@@ -185,6 +192,22 @@ class Wall:
     def wait_for(self, expression: str, *arguments: Any) -> None:
         """Until a JavaScript function returns true for the arguments."""
         self.page.wait_for_function(expression, arg=list(arguments), timeout=WAIT_MS, polling=50)
+
+    def until(self, condition: Callable[[], Any], what: Callable[[], Any] = lambda: "") -> Any:
+        """As `until`, for what events bring: Playwright hands them over only during a call, and never while this thread sleeps."""
+        return until(condition, what, lambda: self.page.wait_for_timeout(PAUSE_S * 1000))
+
+    def sent(self, key: str) -> list[Any]:
+        """What the page sends under this key from its next connection on; wait for it with `self.until`."""
+        found: list[Any] = []
+
+        def note(payload: str | bytes) -> None:
+            message = json.loads(payload)
+            if key in message:
+                found.append(message[key])
+
+        self.page.on("websocket", lambda socket: socket.on("framesent", note))
+        return found
 
     def state(self, selector: str) -> str | None:
         return self.page.get_attribute(selector, "data-state")

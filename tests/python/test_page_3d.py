@@ -6,7 +6,6 @@ A point must appear where the matrix that the page says it used puts it; nothing
 from __future__ import annotations
 
 import io
-import json
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -192,10 +191,10 @@ def test_the_points_end_where_the_image_of_the_lens_ends(wall: Wall) -> None:
 def test_a_camera_that_is_not_chosen_is_neither_shown_nor_watched(wall: Wall) -> None:
     sent = watched(wall)
     open_view(wall)
-    until(lambda: sent and sorted(w["stream"] for w in sent[-1]) == STREAMS, lambda: sent)
+    wall.until(lambda: sent and sorted(w["stream"] for w in sent[-1]) == STREAMS, lambda: sent)
     assert all(w["width"] <= 320 and w["rate_hz"] <= 10 for w in sent[-1])
     show_only(wall, "side")
-    assert sorted(w["stream"] for w in sent[-1]) == ["side/color", "side/depth"]
+    wall.until(lambda: sorted(w["stream"] for w in sent[-1]) == ["side/color", "side/depth"], lambda: sent[-1])
     _, front = FRONT.seen(FRONT.depth)
     (color,) = pixels(wall, tuple(front[120, 12]))
     assert max(color) < 90, "the points of front are gone"
@@ -203,14 +202,7 @@ def test_a_camera_that_is_not_chosen_is_neither_shown_nor_watched(wall: Wall) ->
 
 def watched(wall: Wall) -> list[list[dict]]:
     """The watch lists that the page sends from now on; it is loaded anew for that."""
-    sent: list[list[dict]] = []
-
-    def note(payload: str | bytes) -> None:
-        message = json.loads(payload)
-        if "watch" in message:
-            sent.append(message["watch"])
-
-    wall.page.on("websocket", lambda socket: socket.on("framesent", note))
+    sent = wall.sent("watch")
     wall.page.reload()
     wall.wait_for_image(*STREAMS)
     return sent
@@ -222,7 +214,7 @@ def test_escape_closes_the_view_and_its_streams_and_a_hidden_tab_watches_nothing
     open_view(wall)
     assert not wall.page.locator("#wall").is_visible()
     wall.page.evaluate(VISIBILITY, "hidden")
-    until(lambda: sent[-1] == [], lambda: sent[-1])
+    wall.until(lambda: sent[-1] == [], lambda: sent[-1])
     wall.page.wait_for_timeout(700)
     frames = wall.page.evaluate("depthrig.view.frames")
     wall.page.wait_for_timeout(700)
@@ -231,7 +223,7 @@ def test_escape_closes_the_view_and_its_streams_and_a_hidden_tab_watches_nothing
     settle(wall)
     wall.page.keyboard.press("Escape")
     wall.page.wait_for_selector("#cloud", state="hidden")
-    until(lambda: sorted(map(str, sent[-1])) == sorted(map(str, on_the_wall)), lambda: sent[-1])
+    wall.until(lambda: sorted(map(str, sent[-1])) == sorted(map(str, on_the_wall)), lambda: sent[-1])
     wall.wait_for_image(*STREAMS)
     frames = wall.page.evaluate("depthrig.view.frames")
     wall.page.wait_for_timeout(500)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -236,20 +235,14 @@ def test_one_to_one_shows_a_pixel_as_a_pixel(wall: Wall) -> None:
 
 
 def test_numbers_are_asked_for_only_while_they_are_shown(wall: Wall) -> None:
-    sent: list[list[dict]] = []
-    wall.page.on(
-        "websocket",
-        lambda socket: socket.on(
-            "framesent", lambda text: "watch" in json.loads(text) and sent.append(json.loads(text)["watch"])
-        ),
-    )
+    sent = wall.sent("watch")
     wall.page.reload()
     wall.wait_for_image(*STREAMS)
     assert not any(w.get("measure") for w in sent[-1])
     open_aids(wall, "still/depth")
-    until(lambda: [w["stream"] for w in sent[-1] if w.get("measure")] == ["still/depth"], lambda: sent[-1])
+    wall.until(lambda: [w["stream"] for w in sent[-1] if w.get("measure")] == ["still/depth"], lambda: sent[-1])
     wall.page.keyboard.press("a")
-    until(lambda: not any(w.get("measure") for w in sent[-1]), lambda: sent[-1])
+    wall.until(lambda: not any(w.get("measure") for w in sent[-1]), lambda: sent[-1])
     assert not wall.page.locator("#aids").is_visible()
 
 

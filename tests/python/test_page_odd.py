@@ -138,6 +138,26 @@ def test_a_stream_whose_size_changes_is_drawn_in_its_new_size(browser: Browser, 
             assert (left == right) == (columns == 1)
 
 
+def test_a_key_before_the_first_status_is_answered(browser: Browser, rig: Address) -> None:
+    is_late = {"now": True}
+
+    def late(message: str | bytes) -> str | bytes | None:
+        return None if is_late["now"] and isinstance(message, str) and '"status"' in message else message
+
+    with blank(browser, rig.origin) as wall:
+        wall.page.route_web_socket(SOCKET, through(late))
+        wall.open(rig.text)
+        wall.wait_for_state("#connection", "live")
+        wall.page.keyboard.press("Space")
+        until(lambda: "not yet said" in wall.page.inner_text("#record-error"), wall.record_text)
+        wall.page.keyboard.press("a")
+        until(lambda: "none is shown" in wall.page.inner_text("#problem"))
+        is_late["now"] = False
+        # What was said is out of date, and the key works.
+        wall.wait_for_state("#record-state", "idle")
+        until(lambda: wall.page.inner_text("#record-error") == "", wall.record_text)
+
+
 def test_a_page_that_missed_a_start_says_so_and_stops_nothing(browser: Browser, rig: Address) -> None:
     is_late = {"now": False}
 

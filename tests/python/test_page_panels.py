@@ -467,6 +467,28 @@ def test_before_a_start_the_page_says_whether_the_rig_is_ready(wall: Wall) -> No
     assert "doctor" in ready.inner_text() or wall.state("#ready") != "go"
 
 
+def test_after_a_click_on_a_panel_or_the_help_the_key_still_records(wall: Wall) -> None:
+    """A panel and a dialog give the focus back when they are closed: not to a button that a pointer pressed, which Space would press again."""
+    wall.page.click("button[data-panel=sync]")
+    wall.page.wait_for_selector("#panel .sync")
+    wall.page.keyboard.press("Escape")
+    wall.page.wait_for_selector("#panel", state="hidden")
+    wall.page.click("#show-help")
+    wall.page.wait_for_selector("#help", state="visible")
+    wall.page.keyboard.press("Escape")
+    wall.page.wait_for_selector("#help", state="hidden")
+    start(wall)
+    wall.page.click("button[data-panel=sync]")
+    wall.page.click("#panel-close")
+    stop(wall)
+    # By keyboard the focus comes back to where it was.
+    wall.focus_by_keyboard("button[data-panel=sync]")
+    wall.page.keyboard.press("Enter")
+    wall.page.wait_for_selector("#panel .sync")
+    wall.page.keyboard.press("Escape")
+    wall.wait_for("() => document.activeElement === document.querySelector('button[data-panel=sync]')")
+
+
 def test_every_stream_is_in_the_table_of_the_synchronisation(wall: Wall) -> None:
     panel = open_panel(wall, "y", "Synchronisation")
     heads = panel.locator("tbody th")

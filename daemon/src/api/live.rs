@@ -1,4 +1,4 @@
-//! The WebSocket of the live page: status, images, and questions about pixels. docs/live-page.md describes its messages.
+//! The WebSocket of the live page: status, images, signals, and questions about pixels. docs/live-page.md describes its messages.
 
 use super::limits::end_of;
 use super::recordings;
@@ -8,7 +8,8 @@ use super::token::Token;
 use crate::control::{Control, ReplayControl, SeekRequest, Shown};
 use crate::status::{ReplayStatus, RigStatus};
 use crate::viewers::{
-    Geometry, Measured, Message, OfStream, PROTOCOL, PixelAnswer, PixelQuestion, Place, Viewers, Watch,
+    Geometry, Measured, Message, News, OfStream, PROTOCOL, PixelAnswer, PixelQuestion, Place, ShownSignal,
+    SignalFeed, SignalPlace, Viewers, Watch,
 };
 use axum::Extension;
 use axum::extract::ws::{CloseFrame, Message as Frame, WebSocket, WebSocketUpgrade};
@@ -49,6 +50,8 @@ mod code {
 pub(super) struct Live {
     /// Those who look at the rig.
     pub(super) viewers: Viewers,
+    /// The signals of the live rig, whatever a page shows.
+    pub(super) signals: SignalFeed,
     /// True when the service ends.
     pub(super) stopped: watch::Receiver<bool>,
     /// One for each connection: what has been upgraded has left the places of the API.
@@ -65,6 +68,8 @@ enum Request {
     Watch(Vec<Watch>),
     Credit(u32),
     Pixel(PixelQuestion),
+    /// `null`: none is shown any more.
+    Signals(Option<Vec<ShownSignal>>),
     Replay(Steer),
 }
 
@@ -109,6 +114,7 @@ enum Answer<'a> {
     Geometry(&'a OfStream<Geometry>),
     Measure(&'a OfStream<Measured>),
     Pixel(PixelAnswer),
+    Signals(News),
     Problem { message: String },
 }
 
@@ -207,7 +213,8 @@ async fn begin(
         dataset: asked.dataset.as_deref(),
     };
     send(socket, &Answer::Hello(hello)).await.map_err(|_| End::new(code::STOPPED, ""))?;
-    Ok(Client { place, messages, view })
+    let signals = Some(Arc::new(live.signals.enter()));
+    Ok(Client { place, signals, messages, view })
 }
 
 /// The source of a page's images: the rig, or one of its recordings.
@@ -240,6 +247,8 @@ impl Drop for View {
 /// A client that may look.
 struct Client {
     place: Place,
+    /// `None` only while it is dropped.
+    signals: Option<Arc<SignalPlace>>,
     messages: mpsc::Receiver<Message>,
     view: View,
 }
@@ -263,6 +272,7 @@ impl Client {
                                 status.reset_immediately();
                                 Ok(())
                             }
+                            Ok(Done::News(news)) => send(socket, &Answer::Signals(news)).await,
                             Ok(Done::Problem(message)) => send(socket, &Answer::Problem { message }).await,
                             Err(end) => return Some(end),
                         },
@@ -315,6 +325,22 @@ impl Client {
                 self.place.ask(question);
                 Done::Quietly
             }
+            Request::Signals(shown) => {
+                let place = self.signals.clone();
+                let show = move || match (place, shown) {
+                    (Some(place), Some(shown)) => place.show(&shown).map(Some),
+                    (place, _) => {
+                        place.inspect(|place| place.leave());
+                        Ok(None)
+                    }
+                };
+                match tokio::task::spawn_blocking(show).await {
+                    Ok(Ok(Some(news))) => Done::News(news),
+                    Ok(Ok(None)) => Done::Quietly,
+                    Ok(Err(e)) => problem(e),
+                    Err(_) => failed_inside(),
+                }
+            }
             Request::Replay(steer) => {
                 let rig = Arc::clone(&self.view.rig);
                 let steered =
@@ -323,9 +349,7 @@ impl Client {
                     Ok(Some(Ok(_))) => Done::Steered,
                     Ok(Some(Err(e))) => problem(e),
                     Ok(None) => Done::Problem("this page shows cameras and no recording".to_owned()),
-                    Err(_) => {
-                        Done::Problem("the call failed inside the daemon; its log says more".to_owned())
-                    }
+                    Err(_) => failed_inside(),
                 }
             }
         })
@@ -337,7 +361,20 @@ enum Done {
     Quietly,
     /// The status has changed.
     Steered,
+    News(News),
     Problem(String),
+}
+
+fn failed_inside() -> Done {
+    Done::Problem("the call failed inside the daemon; its log says more".to_owned())
+}
+
+impl Drop for Client {
+    fn drop(&mut self) {
+        let place = self.signals.take();
+        // Closing channels takes a moment.
+        drop(tokio::task::spawn_blocking(move || drop(place)));
+    }
 }
 
 async fn send(socket: &mut WebSocket, answer: &Answer<'_>) -> Result<(), axum::Error> {

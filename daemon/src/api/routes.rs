@@ -10,7 +10,7 @@ use super::requests::{
 use super::{SERVER_HEADER, allowed, guard, limits, live};
 use crate::control::{
     CalibratedImage, CameraControls, Control, ControlChanges, ControlList, ControlRequest, EpisodeRequest,
-    RecordRequest, ReplayControl, SeekRequest, StopRequest,
+    RecordRequest, RecordingEpisodes, ReplayControl, SeekRequest, StopRequest,
 };
 use crate::doctor::Examined;
 use crate::losses::RecordingLosses;
@@ -52,7 +52,7 @@ pub struct Route {
 const CALIBRATION_EVENTS: &str = "/v1/calibration/events";
 
 /// Every call of the API.
-pub const ROUTES: [Route; 34] = [
+pub const ROUTES: [Route; 35] = [
     Route { method: "GET", path: "/v1/status", handler: || get(status) },
     Route { method: "GET", path: "/v1/health", handler: || get(health) },
     Route { method: "GET", path: "/v1/config", handler: || get(config) },
@@ -62,6 +62,7 @@ pub const ROUTES: [Route; 34] = [
     Route { method: "POST", path: "/v1/record/stop", handler: || post(record_stop) },
     Route { method: "POST", path: "/v1/record/note", handler: || post(record_note) },
     Route { method: "POST", path: "/v1/episode", handler: || post(episode) },
+    Route { method: "GET", path: "/v1/episodes", handler: || get(episodes) },
     Route { method: "GET", path: "/v1/recordings", handler: || get(recordings_list) },
     Route { method: "GET", path: "/v1/recordings/image", handler: || get(recordings_image) },
     Route { method: "POST", path: "/v1/recordings/mark", handler: || post(recordings_mark) },
@@ -268,6 +269,10 @@ async fn record_note(State(rig): State<Rig>, body: Bytes) -> Answer<StatusCode> 
 async fn episode(State(rig): State<Rig>, body: Bytes) -> Answer<Json<Episode>> {
     let request: EpisodeRequest = parse(&body)?;
     call(rig, move |rig| rig.episode(&request)).await.map(Json)
+}
+
+async fn episodes(State(rig): State<Rig>) -> Answer<Json<Option<RecordingEpisodes>>> {
+    call(rig, |rig| Ok(rig.episodes())).await.map(Json)
 }
 
 async fn replay(State(rig): State<Rig>) -> Answer<Json<ReplayStatus>> {

@@ -10,7 +10,7 @@ use super::{MAX_CONNECTIONS, foxglove, guard, routes};
 use crate::config::ControlConfig;
 use crate::control::Control;
 use crate::foxglove::Foxglove;
-use crate::viewers::Viewers;
+use crate::viewers::{SignalFeed, Viewers};
 use crate::{Error, ErrorKind, Result};
 use axum::{Extension, Router};
 use core::time::Duration;
@@ -78,9 +78,10 @@ impl ServerHandle {
         };
         let (stop, stopped) = watch::channel(false);
         let viewers = Viewers::new(runtime_dir.clone(), rig.clone());
+        let signals = SignalFeed::new(runtime_dir.clone());
         let foxglove = Foxglove::new(runtime_dir.clone(), rig.clone(), Arc::clone(&control));
         let address = PageAddress::of(tcp, foxglove_tcp, token.as_deref().map(Token::path));
-        let served = Served { control, viewers, foxglove, address, stopped };
+        let served = Served { control, viewers, signals, foxglove, address, stopped };
         let serve = move || {
             runtime.block_on(run(served, listeners));
             // A call that is still under way ends by itself; nobody waits for its answer.
@@ -135,18 +136,25 @@ struct Listeners {
 struct Served {
     control: Arc<dyn Control>,
     viewers: Viewers,
+    signals: SignalFeed,
     foxglove: Foxglove,
     address: PageAddress,
     stopped: watch::Receiver<bool>,
 }
 
 async fn run(served: Served, listeners: Listeners) {
-    let Served { control, viewers, foxglove, address, stopped } = served;
+    let Served { control, viewers, signals, foxglove, address, stopped } = served;
     let Listeners { unix, port, foxglove: foxglove_port } = listeners;
     let pages = Arc::new(Semaphore::new(MAX_CONNECTIONS));
     let live = |token: Option<Arc<Token>>| {
         let places = Arc::clone(&pages);
-        Extension(Live { viewers: viewers.clone(), stopped: stopped.clone(), places, token })
+        Extension(Live {
+            viewers: viewers.clone(),
+            signals: signals.clone(),
+            stopped: stopped.clone(),
+            places,
+            token,
+        })
     };
     let rig = Arc::clone(&control);
     let router = routes::router(control, Events::new(stopped.clone()))

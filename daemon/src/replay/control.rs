@@ -1,7 +1,9 @@
 //! A replay as the control API sees it: a rig whose cameras are datasets.
 
 use super::{Inner, lock};
-use crate::control::{Control, EpisodeRequest, LiveRig, RecordRequest, ReplayControl, SeekRequest};
+use crate::control::{
+    Control, EpisodeRequest, LiveRig, RecordRequest, RecordingEpisodes, ReplayControl, SeekRequest,
+};
 use crate::losses::RecordingLosses;
 use crate::recording::{self, Begun, StreamFacts};
 use crate::rig::report;
@@ -272,6 +274,10 @@ impl Control for Inner {
 
     fn episode(&self, request: &EpisodeRequest) -> Result<Episode> {
         lock(&self.recording).episode(request)
+    }
+
+    fn episodes(&self) -> Option<RecordingEpisodes> {
+        lock(&self.recording).episodes()
     }
 
     fn record_losses(&self) -> Option<RecordingLosses> {

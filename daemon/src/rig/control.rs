@@ -5,7 +5,7 @@ use crate::Result;
 use crate::attached::System;
 use crate::control::{
     CalibratedImage, CameraControls, Control, ControlChanges, ControlList, ControlRequest, EpisodeRequest,
-    LiveRig, RecordRequest, Shows,
+    LiveRig, RecordRequest, RecordingEpisodes, Shows,
 };
 use crate::doctor::{self, Surroundings};
 use crate::losses::RecordingLosses;
@@ -105,6 +105,10 @@ impl Control for Inner {
 
     fn episode(&self, request: &EpisodeRequest) -> Result<Episode> {
         self.recording().episode(request)
+    }
+
+    fn episodes(&self) -> Option<RecordingEpisodes> {
+        self.recording().episodes()
     }
 
     fn record_losses(&self) -> Option<RecordingLosses> {

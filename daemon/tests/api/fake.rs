@@ -1,8 +1,8 @@
 //! A scripted rig.
 
 use depthrig_daemon::control::{
-    CalibratedImage, Control, EpisodeRequest, LossBucket, Losses, RecordRequest, RecordingLosses,
-    ReplayControl, SeekRequest, UncertaintyOfImage,
+    CalibratedImage, Control, EpisodeRequest, LossBucket, Losses, RecordRequest, RecordingEpisodes,
+    RecordingLosses, ReplayControl, SeekRequest, UncertaintyOfImage,
 };
 use depthrig_daemon::status::{
     CameraState, CameraStatus, ClockStatus, LinkState, LinkStatus, PreparingStatus, RecordingStatus,
@@ -10,7 +10,7 @@ use depthrig_daemon::status::{
     SignalState, SignalStatus, StreamStatus,
 };
 use depthrig_daemon::{Error, ErrorKind, Result};
-use depthrig_recorder::Episode;
+use depthrig_recorder::{Episode, EpisodeOutcome};
 use std::sync::{Condvar, Mutex};
 use std::time::Duration;
 
@@ -266,6 +266,21 @@ impl Control for Fake {
             }),
             _ => Err(Error::new(ErrorKind::WrongState, "no episode is running")),
         }
+    }
+
+    fn episodes(&self) -> Option<RecordingEpisodes> {
+        let path = self.inner.lock().unwrap().recording.as_ref()?.path.clone();
+        let episode = Episode {
+            number: 1,
+            task: "cup".into(),
+            start_utc_ns: 7,
+            end_utc_ns: Some(9),
+            outcome: Some(EpisodeOutcome::Failure),
+            discarded: true,
+            cut_start: false,
+            cut_end: false,
+        };
+        Some(RecordingEpisodes { path, episodes: vec![episode] })
     }
 
     fn record_note(&self, text: &str) -> Result<()> {
