@@ -13,6 +13,8 @@ use std::sync::Arc;
 
 /// The arm goes from end to end in so long, and turns there: its joints have a kink.
 const WAY_NS: i64 = 11_000_000_000 / 6;
+/// Sets of so long at an end may be left out.
+const SECOND_NS: i64 = 1_000_000_000;
 /// The truth is computed in 32-bit floats, as the export is.
 const ROUNDING: f64 = 3e-6;
 
@@ -90,6 +92,33 @@ fn chunk(fs: &MemFs, name: &str) -> Vec<u8> {
     zstd::bulk::decompress(&packed, 1 << 20).unwrap()
 }
 
+#[test]
+fn a_state_lacks_a_row_if_any_of_its_signals_does_and_is_in_the_order_of_names() {
+    let fs = MemFs::new();
+    let r = recorder(&fs, options());
+    for n in 0..6 {
+        let mut set = set(&session(), n);
+        if n == 2 {
+            set.signals.retain(|part| part.signal == 0);
+        }
+        r.push(set).unwrap();
+        settle(&r);
+    }
+    r.finish().unwrap();
+    let signals = VectorOptions { gaps: Gaps::Mask, ..VectorOptions::default() };
+    let mut zarr = Zarr::new(RowOptions { signals, ..RowOptions::default() });
+    let on = &mut |_| ControlFlow::Continue(());
+    export(&fs, &mut zarr, vec![open(&fs)], Path::new("/export"), ExportOptions { workers: 1 }, on).unwrap();
+    assert_eq!(chunk(&fs, "missing_state/0"), [0, 0, 1, 0, 0, 0]);
+    let facts: serde_json::Value =
+        serde_json::from_slice(&contents(&fs, Path::new("/export/.zattrs"))).unwrap();
+    let names = ["gripper.width", "gripper.closed", "joints.shoulder", "joints.elbow"];
+    assert_eq!(
+        facts["depthrig"]["vectors"][0]["names"],
+        serde_json::json!(names.map(|n| format!("arm/{n}")))
+    );
+}
+
 proptest! {
     #![proptest_config(ProptestConfig { cases: 48, ..ProptestConfig::default() })]
     #[test]
@@ -99,12 +128,18 @@ proptest! {
         lost in proptest::collection::vec(any::<prop::sample::Index>(), 0..12),
         steps in proptest::collection::vec(1_000_000_i64..300_000_000, 2..25),
         max_gap_ns in 20_000_000_u64..400_000_000,
+        silent_ns in prop_oneof![Just([0, 0]), [0_i64..1_500_000_000, 0_i64..1_500_000_000]],
     ) {
         let ticks: Vec<_> = steps.iter().scan(M0 + phase_ns, |t, step| { *t += step; Some(*t) }).collect();
         let span = ticks[ticks.len() - 1] - ticks[0];
         let count = (span / period_ns + 2) as usize;
+        let mut samples: Vec<_> =
+            (0..count).map(|i| ticks[0] - period_ns / 3 + i as i64 * period_ns).collect();
         // Sets at either end may lie outside of the samples.
-        let mut samples: Vec<_> = (0..count).map(|i| ticks[0] - period_ns / 3 + i as i64 * period_ns).collect();
+        let heard = ticks[0] + silent_ns[0]..=ticks[ticks.len() - 1] + period_ns - silent_ns[1];
+        if samples.iter().filter(|t| heard.contains(t)).count() > 2 {
+            samples.retain(|t| silent_ns == [0, 0] || heard.contains(t));
+        }
         for lost in &lost {
             if samples.len() > 2 {
                 samples.remove(lost.index(samples.len()));
@@ -125,6 +160,24 @@ proptest! {
         let values: Vec<_> = values.as_chunks().0.iter().map(|b| f64::from(f32::from_le_bytes(*b))).collect();
         let missing = chunk(&fs, "missing_state/0");
         let times: Vec<_> = chunk(&fs, "utc_ns/0").as_chunks().0.iter().map(|b| i64::from_le_bytes(*b) - T0 + M0).collect();
+        // Up to a second without a value at either end is left out.
+        let [first, last] = [times[0], times[times.len() - 1]];
+        for out in [ticks[0]..first, last + 1..ticks[ticks.len() - 1] + 1] {
+            let out: Vec<_> = ticks.iter().filter(|t| out.contains(t)).collect();
+            if let [begin, .., end] = out[..] {
+                prop_assert!(end - begin <= SECOND_NS, "{} ns are left out", end - begin);
+            }
+        }
+        let silent = |missing: &mut dyn Iterator<Item = (&u8, &i64)>| {
+            let times: Vec<_> = missing.take_while(|(m, _)| **m != 0).map(|(_, t)| *t).collect();
+            times.first().zip(times.last()).map(|(a, b)| (a - b).abs())
+        };
+        let rows = || missing.iter().zip(&times);
+        if missing.contains(&0) {
+            for kept in [silent(&mut rows()), silent(&mut rows().rev())].into_iter().flatten() {
+                prop_assert!(kept > SECOND_NS, "{} ns at an end are kept without a value", kept);
+            }
+        }
         for time in &ticks {
             let after = samples.partition_point(|t| t < time);
             let exact = samples.get(after) == Some(time);
@@ -136,7 +189,14 @@ proptest! {
                 continue;
             };
             prop_assert_eq!(missing[row] != 0, gap.is_none(), "row {} at {}", row, time);
-            let Some(span) = gap else { continue };
+            let Some(span) = gap else {
+                // The last sample before is held.
+                let held = samples[..after].last().map_or([0.0; 4], |t| joints_at(*t));
+                for (value, held) in values[4 * row..].iter().zip(held) {
+                    prop_assert!((value - held).abs() < ROUNDING, "row {} does not hold the last sample", row);
+                }
+                continue;
+            };
             if span.start / WAY_NS != span.end / WAY_NS {
                 continue;
             }
