@@ -143,9 +143,9 @@ impl Objects {
         let mut header = array_header(kind, shape, 0x0b);
         let mut layout = Message::default();
         layout.bytes(&[3, 2, shape.len() as u8 + 1]).u64(address).u32(1);
-        shape.iter().skip(1).for_each(|n| {
+        for n in shape.iter().skip(1) {
             layout.u32(*n as u32);
-        });
+        }
         header.add(0x08, layout.u32(kind.bytes()));
         // Shuffle, then deflate.
         let mut filters = Message::default();
@@ -277,9 +277,9 @@ fn array_header(kind: Kind, shape: &[u64], fill: u8) -> Header {
     let mut header = Header::default();
     let mut space = Message::default();
     space.bytes(&[2, shape.len() as u8, 0, 1]);
-    shape.iter().for_each(|n| {
+    for n in shape {
         space.u64(*n);
-    });
+    }
     header.add(0x01, &space);
     header.add(0x03, &Message(kind.message()));
     header.add(0x05, Message::default().bytes(&[3, fill]));

@@ -63,7 +63,7 @@ fn files(fs: &MemFs, dir: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
 /// Whether a file is of an export that is not complete; arrays of Zarr have hidden files of their own.
 fn is_temporary(path: &Path) -> bool {
     let name = path.file_name().unwrap().to_str().unwrap();
-    name == ".export.json" || name.starts_with(".part_") || (name.starts_with('.') && name.ends_with(".tmp"))
+    name.starts_with('.') && !name.starts_with(".z")
 }
 
 fn whole(make: Make, source: &MemFs) -> BTreeMap<PathBuf, Vec<u8>> {
