@@ -1,5 +1,5 @@
 """Demonstrations from end to end: simulated cameras see an arm, whose process publishes its joints; episodes are recorded, one is
-discarded, the daemon is killed in one; what was recovered becomes a dataset that LeRobot trains on.
+discarded, the daemon is killed in one; what was recovered becomes a dataset that LeRobot trains on and robomimic loads.
 
 The values that must be in the export are NumPy's interpolation of the samples as Python's mcap reads them.
 """
@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import depthrig
+import h5py
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -31,6 +32,11 @@ __all__ = ["binary", "runtime"]
 
 LOADER = ROOT / ".venv-lerobot" / "bin" / "python"
 JOINTS = ["base", "shoulder", "elbow", "wrist"]
+VECTORS = {
+    "observation.state": [("gripper/values", "fields"), ("joint_position/joint_states", "position")],
+    "action": [("action/values", "fields")],
+}
+"""Topics and fields of the arm's vectors."""
 RIG = """
 rig = "cell"
 [sets]
@@ -108,6 +114,32 @@ def samples(dataset: Path, topic: str, values: str) -> tuple[np.ndarray, np.ndar
     return np.array(times), np.array(rows)
 
 
+def numbers_at(dataset: Path, times: np.ndarray, parts: list[tuple[str, str]]) -> np.ndarray:
+    """The arm's signals at these times, by NumPy."""
+    columns = []
+    for topic, kind in parts:
+        at, values = samples(dataset, f"/cell/arm/{topic}", kind)
+        assert at[0] <= times[0] and times[-1] <= at[-1]
+        columns += [np.interp(times - at[0], at - at[0], values[:, i]) for i in range(values.shape[1])]
+    return np.stack(columns, axis=1)
+
+
+def images(dataset: Path, topic: str) -> dict[int, np.ndarray]:
+    """The image of each capture time, UTC nanoseconds, by Python's mcap and Pillow."""
+    found = {}
+    for segment in sorted(dataset.glob("seg_*.mcap")):
+        with segment.open("rb") as file:
+            reader = make_reader(file, decoder_factories=[DecoderFactory()])
+            for schema, _, message, decoded in reader.iter_decoded_messages(topics=[topic]):
+                if schema.name.endswith("CompressedImage"):
+                    with Image.open(io.BytesIO(decoded.data)) as image:
+                        found[message.publish_time] = np.asarray(image)
+                else:
+                    pixels = np.frombuffer(decoded.data, dtype="<u2")
+                    found[message.publish_time] = pixels.reshape(decoded.height, decoded.width, 1)
+    return found
+
+
 def exported_rows(out: Path) -> list[dict]:
     return [r for f in sorted(out.rglob("data/**/*.parquet")) for r in pq.read_table(f).to_pylist()]
 
@@ -157,18 +189,9 @@ def test_the_export_has_the_arm_as_it_was_at_each_set(
     assert "at most 0.2 s apart" in state["info"]["depthrig.interpolation"]
 
     times = np.array([r["capture.utc_ns"] for r in rows])
-    for column, parts in {
-        "observation.state": [("gripper/values", "fields"), ("joint_position/joint_states", "position")],
-        "action": [("action/values", "fields")],
-    }.items():
+    for column, parts in VECTORS.items():
         got = np.array([r[column] for r in rows], dtype=np.float32)
-        expected = []
-        for topic, kind in parts:
-            at, values = samples(recovered, f"/cell/arm/{topic}", kind)
-            assert at[0] <= times[0] and times[-1] <= at[-1]
-            begin = at[0]
-            expected += [np.interp(times - begin, at - begin, values[:, i]) for i in range(values.shape[1])]
-        np.testing.assert_allclose(got, np.stack(expected, axis=1), rtol=3e-7, atol=1e-7)
+        np.testing.assert_allclose(got, numbers_at(recovered, times, parts), rtol=3e-7, atol=1e-7)
 
     # The task was done at the end of the first and of the fourth episode.
     ends = [max(i for i, r in enumerate(rows) if r["episode_index"] == e) for e in (0, 1, 2)]
@@ -204,6 +227,79 @@ def test_zarr_has_the_rows_of_lerobot(binary: str, runtime: Path, recovered: Pat
     assert said["vectors"][0]["names"] == ["arm/gripper.opening", *(f"arm/joint_position.{j}" for j in JOINTS)]
     assert [e["success"] for e in said["episodes"]] == [True, False, True]
     assert said["streams"][1]["depth_unit_m"] == 0.001
+
+
+def test_hdf5_has_every_image_and_value(binary: str, runtime: Path, recovered: Path, tmp_path: Path) -> None:  # noqa: F811
+    out = tmp_path / "hdf5"
+    said = command(binary, runtime, "export", "hdf5", str(recovered), str(out), codes=(0, 3))
+    assert "episode 3 (discarded), episode 5 (running or cut off)" in said
+    # The sample after an episode's last set came with a set that is not of it.
+    assert "without a value" not in said
+    assert sorted(p.name for p in out.iterdir()) == ["demo.hdf5", "export.json"]
+    color = images(recovered, "/cell/top/color/image_compressed")
+    depth = images(recovered, "/cell/top/depth/image_raw")
+    compared = 0
+    with h5py.File(out / "demo.hdf5") as file:
+        data = file["data"]
+        assert list(data) == ["demo_0", "demo_1", "demo_2"]
+        assert json.loads(data.attrs["env_args"]) == {"env_name": "cell", "type": 2, "env_kwargs": {}}
+        assert data.attrs["total"] == sum(d.attrs["num_samples"] for d in data.values())
+        assert [d.attrs["task"] for d in data.values()] == ["task 1", "task 0", "task 0"]
+        assert [d.attrs["success"] for d in data.values()] == [True, False, True]
+        assert {name: list(mask.asstr()) for name, mask in file["mask"].items()} == {
+            "success": ["demo_0", "demo_2"],
+            "failure": ["demo_1"],
+        }
+        for demo in data.values():
+            rows = demo.attrs["num_samples"]
+            times = demo["utc_ns"][:]
+            assert rows >= 4 and (np.diff(times) > 0).all()
+            assert list(demo["dones"]) == [0] * (rows - 1) + [1]
+            assert demo["rewards"][:].sum() == demo["rewards"][-1] == demo.attrs["success"]
+            for name, column in [("obs/state", "observation.state"), ("actions", "action")]:
+                assert demo[name].dtype == np.float32
+                expected = numbers_at(recovered, times, VECTORS[column])
+                np.testing.assert_allclose(demo[name][:], expected, rtol=3e-7, atol=1e-7)
+                assert not demo["missing"][name.removeprefix("obs/")][:].any()
+            for row in range(rows):
+                for name, stored in [("top_color", color), ("top_depth", depth)]:
+                    at = demo["capture_utc_ns"][name][row]
+                    assert demo["missing"][name][row] == (at == 0)
+                    if at:
+                        compared += 1
+                        np.testing.assert_array_equal(demo["obs"][name][row], stored[at])
+                    else:
+                        assert not demo["obs"][name][row].any()
+        assert compared >= 2 * 3 * 4
+        facts = json.loads(file.attrs["depthrig"])
+    assert facts["vectors"][0] == {
+        "array": "state",
+        "names": ["arm/gripper.opening", *(f"arm/joint_position.{j}" for j in JOINTS)],
+    }
+    assert "at most 0.2 s apart" in facts["interpolation"]
+    assert facts["rate_hz"] == 5.0
+    stream = facts["streams"][1]
+    assert (stream["array"], stream["stream"], stream["depth_unit_m"]) == ("top_depth", "top/depth", 0.001)
+    assert stream["intrinsics"]["fx"] > 100 and stream["pose_on_mount"]
+
+
+def test_robomimic_loads_hdf5(binary: str, runtime: Path, recovered: Path, tmp_path: Path) -> None:  # noqa: F811
+    if not LOADER.exists():
+        pytest.skip("the package robomimic is not installed (make test does it)")
+    out, loaded = tmp_path / "hdf5", tmp_path / "loaded.npz"
+    command(binary, runtime, "export", "hdf5", str(recovered), str(out), codes=(0, 3))
+    names = ["state", "top_color", "top_depth"]
+    call = [LOADER, Path(__file__).with_name("robomimic_loader.py"), out / "demo.hdf5", loaded, "success", *names]
+    done = subprocess.run(call, capture_output=True, text=True, timeout=10 * WAIT_S, check=False)
+    assert done.returncode == 0, done.stderr
+    names_of_demos = json.loads(done.stdout.splitlines()[-1])
+    assert names_of_demos == ["demo_0", "demo_2"]
+    got = np.load(loaded)
+    with h5py.File(out / "demo.hdf5") as file:
+        demos = [file["data"][name] for name in names_of_demos]
+        for name in ["actions", "rewards", "dones", *(f"obs/{n}" for n in names)]:
+            expected = np.concatenate([d[name][:] for d in demos])
+            np.testing.assert_array_equal(got[name.removeprefix("obs/")], expected)
 
 
 def test_lerobot_trains_on_it(binary: str, runtime: Path, recovered: Path, tmp_path: Path) -> None:  # noqa: F811
@@ -301,3 +397,14 @@ def test_a_gap_is_named_and_refused_or_masked(binary: str, runtime: Path, tmp_pa
     at, values = samples(dataset, "/cell/arm/joint_position/joint_states", "position")
     before = at <= rows[first]["capture.utc_ns"]
     np.testing.assert_allclose(next(iter(held))[1:], values[before][-1], rtol=3e-7)
+
+    out = tmp_path / "hdf5"
+    call = [binary, "export", "hdf5", str(dataset), str(out)]
+    refused = subprocess.run(call, capture_output=True, text=True, timeout=WAIT_S, check=False)
+    assert refused.returncode == 2 and "--gaps mask" in refused.stderr and not out.exists()
+    command(binary, runtime, *call[1:], "--gaps", "mask", codes=(0, 3))
+    with h5py.File(out / "demo.hdf5") as file:
+        demo = file["data/demo_0"]
+        assert list(demo["missing/state"]) == missing
+        states = np.array([r["observation.state"] for r in rows], dtype=np.float32)
+        np.testing.assert_array_equal(demo["obs/state"][:], states)

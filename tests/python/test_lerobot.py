@@ -17,6 +17,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -83,8 +84,8 @@ def recorded(binary: str, runtime: Path, rig_file: Path, tmp_path_factory: pytes
     return session.parent
 
 
-def export(binary: str, *arguments: object, code: int = 0) -> dict:  # noqa: F811
-    command = [binary, "export", "lerobot", *map(str, arguments), "--json"]
+def export(binary: str, *arguments: object, code: int = 0, layout: str = "lerobot") -> dict:  # noqa: F811
+    command = [binary, "export", layout, *map(str, arguments), "--json"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S, check=False)
     assert done.returncode == code, f"{command} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}"
     return json.loads(done.stdout) if code in (0, 3) else {"error": done.stderr}
@@ -240,24 +241,61 @@ def test_a_set_that_cannot_be_read_is_blank_and_told(binary: str, golden: Golden
             np.testing.assert_array_equal(depth, golden.pixels("front_depth", n))
 
 
-def test_nothing_is_overwritten(binary: str, golden: Golden, tmp_path: Path) -> None:  # noqa: F811
+def test_hdf5_of_a_dataset_with_a_missing_camera(binary: str, golden: Golden, tmp_path: Path) -> None:  # noqa: F811
+    out, without = tmp_path / "out", tmp_path / "without"
+    report = export(binary, golden.dataset, golden.dataset, out, layout="hdf5")
+    assert report["bytes"] == (out / "demo.hdf5").stat().st_size
+    jpegs = golden.stored("/golden/front/color/image_compressed")
+    with h5py.File(out / "demo.hdf5") as file:
+        assert (list(file), list(file["data"])) == (["data"], ["demo_0", "demo_1"]), "nobody judged an episode"
+        assert "no actions" in " ".join(report["losses"]) and "actions" not in file["data/demo_0"]
+        for demo in file["data"].values():
+            assert list(demo["obs"]) == GOLDEN
+            for row in range(6):
+                for stream in GOLDEN:
+                    image = demo["obs"][stream][row]
+                    assert demo["missing"][stream][row] == ((stream, row) == MISSING)
+                    if (stream, row) == MISSING:
+                        assert not image.any() and demo["capture_utc_ns"][stream][row] == 0
+                    elif stream == "front_color":
+                        expected = np.asarray(Image.open(io.BytesIO(jpegs[row][0])))
+                        np.testing.assert_array_equal(image, expected)
+                        assert demo["capture_utc_ns"][stream][row] == jpegs[row][1]
+                    else:
+                        np.testing.assert_array_equal(image[..., 0], golden.pixels(stream, row))
+            kinds = {stream: demo["obs"][stream].dtype for stream in GOLDEN}
+        assert [kinds[stream] for stream in GOLDEN] == [np.uint8, np.uint16, np.uint8, np.uint16]
+        facts = json.loads(file.attrs["depthrig"])
+        assert {s["array"]: s["depth_unit_m"] for s in facts["streams"]}["near_depth"] == 0.0001
+    export(binary, "--incomplete", "leave-out", golden.dataset, without, layout="hdf5")
+    with h5py.File(out / "demo.hdf5") as full, h5py.File(without / "demo.hdf5") as less:
+        kept = [row for row in range(6) if row != MISSING[1]]
+        for stream in GOLDEN:
+            before, after = full["data/demo_0/obs"][stream][:], less["data/demo_0/obs"][stream][:]
+            np.testing.assert_array_equal(after, before[kept])
+            assert not less["data/demo_0/missing"][stream][:].any()
+
+
+@pytest.mark.parametrize("layout", ["lerobot", "hdf5"])
+def test_nothing_is_overwritten(binary: str, golden: Golden, tmp_path: Path, layout: str) -> None:  # noqa: F811
     out = tmp_path / "out"
     out.mkdir()
     (out / "mine.txt").write_text("mine")
-    assert "is not empty" in export(binary, golden.dataset, out, code=1)["error"]
+    assert "is not empty" in export(binary, golden.dataset, out, code=1, layout=layout)["error"]
     assert [p.name for p in out.iterdir()] == ["mine.txt"]
     done = tmp_path / "done"
-    export(binary, golden.dataset, done)
+    export(binary, golden.dataset, done, layout=layout)
     before = {name: (done / name).stat().st_mtime_ns for name in tree(done)}
-    export(binary, golden.dataset, done)
+    export(binary, golden.dataset, done, layout=layout)
     assert {name: (done / name).stat().st_mtime_ns for name in tree(done)} == before, "it was complete already"
-    assert "differs in its options" in export(binary, "--task", "another", golden.dataset, done, code=1)["error"]
+    refused = export(binary, "--task", "another", golden.dataset, done, code=1, layout=layout)
+    assert "differs in its options" in refused["error"]
     assert {name: (done / name).stat().st_mtime_ns for name in tree(done)} == before
 
 
 def test_datasets_that_do_not_fit_are_refused(binary: str, golden: Golden, recorded: Path, tmp_path: Path) -> None:  # noqa: F811
     error = export(binary, golden.dataset, recorded, tmp_path / "out", code=2)["error"]
-    assert "cannot be episodes of one LeRobot dataset" in error
+    assert "cannot be episodes of one export" in error
     assert "front/color" in error
     assert not (tmp_path / "out").exists()
     error = export(binary, "--stream", "front/nothing", golden.dataset, tmp_path / "out", code=2)["error"]
@@ -265,19 +303,20 @@ def test_datasets_that_do_not_fit_are_refused(binary: str, golden: Golden, recor
     assert not (tmp_path / "out").exists()
 
 
-def test_a_killed_export_goes_on(binary: str, golden: Golden, recorded: Path, tmp_path: Path) -> None:  # noqa: F811
+@pytest.mark.parametrize("layout", ["lerobot", "hdf5"])
+def test_a_killed_export_goes_on(binary: str, recorded: Path, tmp_path: Path, layout: str) -> None:  # noqa: F811
     """Killed at many moments, the export ends with the same result as in one run."""
     arguments = ["--stream", "lingbot_1/color", "--stream", "lingbot_1/depth", recorded, recorded]
     whole = tmp_path / "whole"
     started = time.monotonic()
-    export(binary, *arguments, whole)
+    export(binary, *arguments, whole, layout=layout)
     length = time.monotonic() - started
     expected = tree(whole)
     resumed = 0
     for attempt in range(ATTEMPTS):
         out = tmp_path / f"killed{attempt}"
         for _ in range(3):
-            command = [binary, "export", "lerobot", *map(str, arguments), str(out)]
+            command = [binary, "export", layout, *map(str, arguments), str(out)]
             process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
             time.sleep(length * (attempt + 0.5) / ATTEMPTS)
             process.send_signal(signal.SIGKILL)
@@ -285,7 +324,7 @@ def test_a_killed_export_goes_on(binary: str, golden: Golden, recorded: Path, tm
                 break
         else:
             resumed += any(out.glob(".part_*"))
-            export(binary, *arguments, out)
+            export(binary, *arguments, out, layout=layout)
         assert tree(out) == expected, f"attempt {attempt}"
         assert load(out / "export.json") == load(whole / "export.json")
     assert resumed > 0, "no attempt was killed in the middle"

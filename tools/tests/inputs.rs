@@ -10,7 +10,7 @@ use std::os::unix::fs::PermissionsExt as _;
 use support::{Home, Ran};
 
 /// The commands, with IN for their input and OUT for their output.
-const COMMANDS: [&str; 20] = [
+const COMMANDS: [&str; 21] = [
     "info IN",
     "verify IN",
     "report IN --out OUT",
@@ -25,6 +25,7 @@ const COMMANDS: [&str; 20] = [
     "replay IN",
     "export bytecameradepth IN OUT",
     "export lerobot IN OUT",
+    "export hdf5 IN OUT",
     "export zarr IN OUT",
     "eval IN --out OUT",
     "cdm relabel IN OUT --engine fill",

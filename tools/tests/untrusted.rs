@@ -108,6 +108,7 @@ fn a_fifo_or_a_device_in_the_place_of_a_file_is_refused_and_not_waited_for() {
         "replay segment",
         "edit segment --scene x",
         "export lerobot segment out",
+        "export hdf5 segment out",
         "export zarr segment out",
         "export bytecameradepth part out",
         "import kinect f.mkv out",

@@ -3,10 +3,11 @@
 //!
 //! A chunk of an image array is one image, so that parts write chunks of their own; a missing image has no chunk and reads as zeros.
 
-use crate::lerobot::encode::{Form, pixels};
-use crate::lerobot::plan;
-use crate::lerobot::schema::{Feature, calibration};
-use crate::{EpisodeUse, Exporter, LerobotOptions, Output, Part, PartOut, PartSets, Parts, Plan, Source};
+use crate::rows::facts::attributes;
+use crate::rows::images::{Form, pixels};
+use crate::rows::plan;
+use crate::rows::schema::Feature;
+use crate::{EpisodeUse, Exporter, Output, Part, PartOut, PartSets, Parts, Plan, RowOptions, Source};
 use depthrig_bus::StreamId;
 use depthrig_recorder::{Error, ErrorKind, PixelMode, Result};
 use serde_json::{Value, json};
@@ -20,7 +21,7 @@ pub struct Zarr(plan::Planned);
 
 impl Zarr {
     /// With these options.
-    pub const fn new(options: LerobotOptions) -> Self {
+    pub const fn new(options: RowOptions) -> Self {
         Self(plan::Planned::new(options))
     }
 }
@@ -130,7 +131,8 @@ impl Exporter for Zarr {
         for group in ["data/", "meta/", ""] {
             write_json(out, &format!("{group}.zgroup"), &json!({ "zarr_format": 2 }))?;
         }
-        write_json(out, ".zattrs", &attributes(plan, sources))
+        let facts = attributes(plan, sources, "depthrig.zarr/1", &short_of);
+        write_json(out, ".zattrs", &json!({ "depthrig": facts }))
     }
 }
 
@@ -146,7 +148,7 @@ fn names(plan: &plan::Plan) -> Vec<String> {
 }
 
 /// LeRobot's `observation.state` is `state` here.
-fn short_of(key: &str) -> &str {
+fn short_of(key: &'static str) -> &'static str {
     key.rsplit('.').next().unwrap_or(key)
 }
 
@@ -189,36 +191,6 @@ fn array(out: &Output<'_>, name: &str, kind: &str, shape: &[usize], bytes: &[u8]
     write_json(out, &format!("{name}/.zarray"), &head(kind, shape, &chunk))?;
     let first = vec!["0"; shape.len()].join(".");
     out.file(&format!("{name}/{first}"), &packed(bytes)?)
-}
-
-/// Facts of streams, vectors and episodes that the arrays have no place for.
-fn attributes(plan: &plan::Plan, sources: &[Source]) -> Value {
-    let streams = plan.schema.features.iter().filter_map(|feature| {
-        let mut entry = json!({ "array": feature.short, "stream": feature.id.to_string() });
-        let record = sources.first()?.session().streams.iter().find(|s| s.id == feature.id)?;
-        entry["depth_unit_m"] = json!(record.depth_unit_m);
-        for (key, value) in calibration(record) {
-            entry[key] = value;
-        }
-        Some(entry)
-    });
-    let vectors = plan.schema.vectors.iter().map(|v| json!({ "array": short_of(v.key), "names": v.names() }));
-    let episodes = sources.iter().zip(&plan.episodes).map(|(source, e)| {
-        json!({
-            "session": source.session().name,
-            "task": plan.tasks[e.task],
-            "success": e.is_success,
-            "episode": source.episode(),
-        })
-    });
-    json!({ "depthrig": {
-        "format": "depthrig.zarr/1",
-        "rate_hz": plan.fps,
-        "streams": streams.collect::<Vec<_>>(),
-        "vectors": vectors.collect::<Vec<_>>(),
-        "interpolation": plan.schema.rule(),
-        "episodes": episodes.collect::<Vec<_>>(),
-    } })
 }
 
 fn bytes_of(numbers: &[i64]) -> Vec<u8> {

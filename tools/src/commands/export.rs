@@ -9,7 +9,7 @@ use crate::signals::Stop;
 use anyhow::Result;
 use core::ops::ControlFlow;
 use depthrig_convert::lerobot::Lerobot;
-use depthrig_convert::{ExportOptions, ExportReport, Exporter, Zarr, export};
+use depthrig_convert::{ExportOptions, ExportReport, Exporter, Hdf5, Zarr, export};
 use depthrig_recorder::fs::RealFs;
 use depthrig_recorder::{Dataset, ErrorKind, Mark};
 use std::path::PathBuf;
@@ -41,6 +41,15 @@ Examples:
   depthrig export zarr data/20261121_1015_kitchen kitchen.zarr
   depthrig export zarr data/2026* all.zarr --state arm/joint_position --action policy/action";
 
+/// Examples for `--help` of `export hdf5`.
+const HDF5_EXAMPLES: &str = "\
+Rows, episodes and values are those of depthrig export lerobot, with the same options. OUT/demo.hdf5 is in the layout of robomimic, whose
+loader reads it as it is. Images are exact; a missing one is zeros, and true in missing/CAMERA_STREAM.
+
+Examples:
+  depthrig export hdf5 data/20261121_1015_kitchen kitchen
+  depthrig export hdf5 data/2026* all --state arm/joint_position --action policy/action";
+
 /// Layouts to export to.
 #[derive(Debug, clap::Subcommand)]
 pub enum ExportCommand {
@@ -50,6 +59,9 @@ pub enum ExportCommand {
     /// Export to LeRobot v3.0: an episode per episode, or per dataset without any; JPEG/PNG colour, TIFF depth
     #[command(after_help = lerobot::EXAMPLES)]
     Lerobot(lerobot::Args),
+    /// Export to HDF5 in the layout of robomimic: one file, a group per episode with observations and actions
+    #[command(after_help = HDF5_EXAMPLES)]
+    Hdf5(lerobot::Args),
     /// Export to Zarr in the layout of diffusion_policy's replay buffer: an array per stream, state and action
     #[command(after_help = ZARR_EXAMPLES)]
     Zarr(lerobot::Args),
@@ -84,6 +96,10 @@ pub fn run(command: &ExportCommand, context: &Context) -> Result<Exit> {
         ExportCommand::Lerobot(args) => {
             let (options, common) = args.options();
             drive(&mut Lerobot::new(options), common, context)
+        }
+        ExportCommand::Hdf5(args) => {
+            let (options, common) = args.options();
+            drive(&mut Hdf5::new(options), common, context)
         }
         ExportCommand::Zarr(args) => {
             let (options, common) = args.options();

@@ -1,54 +1,13 @@
 //! Images as LeRobot reads them: a JPEG as it was stored, other colour and grey as PNG, depth as TIFF.
 
 use super::stats::Samples;
-use depthrig_bus::{FrameHeader, Layout, PixelFormat, Sample};
+use crate::rows::images::{Form, format_of, wrong};
+use depthrig_bus::{FrameHeader, PixelFormat};
 use depthrig_recorder::jpeg_pixels;
 use depthrig_recorder::still::{self, StillFormat};
-use depthrig_recorder::{DatasetFrame, Error, ErrorKind, Result};
+use depthrig_recorder::{DatasetFrame, Result};
 use std::io::Cursor;
 use tiff::encoder::{TiffEncoder, colortype};
-
-/// File format of a stream's images in the export.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Form {
-    /// The JPEG that is stored, or a PNG of what is stored losslessly: red, green, blue.
-    Color,
-    /// PNG of 8 bits.
-    Grey8,
-    /// PNG of 16 bits.
-    Grey16,
-    /// TIFF of 16 bits.
-    Depth16,
-    /// TIFF of floats, metres.
-    DepthF32,
-}
-
-impl Form {
-    /// The form for a pixel format; `None` when LeRobot has none.
-    pub(crate) const fn of(format: PixelFormat) -> Option<Self> {
-        Some(match (format.layout(), format.sample(), format.is_depth()) {
-            (Layout::Rgb | Layout::Bgr | Layout::Jpeg, ..) => Self::Color,
-            (Layout::Grey, Sample::U8, false) => Self::Grey8,
-            (Layout::Grey, Sample::U16, false) => Self::Grey16,
-            (Layout::Grey, Sample::U16, true) => Self::Depth16,
-            (Layout::Grey, Sample::F32, true) => Self::DepthF32,
-            _ => return None,
-        })
-    }
-
-    /// Colour channels of an image.
-    pub(crate) const fn channels(self) -> usize {
-        match self {
-            Self::Color => 3,
-            _ => 1,
-        }
-    }
-
-    /// Whether it is depth.
-    pub(crate) const fn is_depth(self) -> bool {
-        matches!(self, Self::Depth16 | Self::DepthF32)
-    }
-}
 
 /// An encoded image.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -56,10 +15,6 @@ pub(super) struct Image {
     pub(super) bytes: Vec<u8>,
     /// Kind of file: `jpg`, `png` or `tiff`.
     pub(super) extension: &'static str,
-}
-
-fn wrong(h: &FrameHeader, what: impl core::fmt::Display) -> Error {
-    Error::new(ErrorKind::Codec, format!("frame {} of {}/{} {what}", h.sequence, h.camera(), h.stream()))
 }
 
 /// Encodes a frame that was read as it is stored; `sample` asks for its pixels' values as well.
@@ -75,30 +30,6 @@ pub(super) fn encode(form: Form, frame: &DatasetFrame, sample: bool) -> Result<(
     let pixels = still::tight(h, &decoded, format);
     let image = lossless(form, h, format, &pixels)?;
     Ok((image, sample.then(|| thinned(form, h, format, &pixels))))
-}
-
-/// The pixels of a frame that was read as it is stored, without padding; colour as red, green, blue.
-pub(crate) fn pixels(form: Form, frame: &DatasetFrame) -> Result<Vec<u8>> {
-    let h = &frame.header;
-    if form == Form::Color && matches!(frame.codec, "jpeg" | "mjpeg") {
-        return jpeg_pixels(&frame.pixels, h);
-    }
-    let format = format_of(form, h)?;
-    let decoded = frame.decoded()?;
-    let mut pixels = still::tight(h, &decoded, format).into_owned();
-    if pixels.len() != format.frame_bytes(h.width, h.height) {
-        return Err(wrong(h, format_args!("has {} bytes, not as many as its size says", pixels.len())));
-    }
-    if format == PixelFormat::Bgr8 {
-        pixels.as_chunks_mut::<3>().0.iter_mut().for_each(|p| p.swap(0, 2));
-    }
-    Ok(pixels)
-}
-
-/// The pixel format of a frame, which its form must be for.
-fn format_of(form: Form, h: &FrameHeader) -> Result<PixelFormat> {
-    let format = h.pixel_format().filter(|f| Form::of(*f) == Some(form));
-    format.ok_or_else(|| wrong(h, "has another pixel format than its session says"))
 }
 
 /// An image of zeros: black, no depth. It stands where a camera delivered nothing.

@@ -1,10 +1,11 @@
 //! Parts become the data files and the metadata of a LeRobot dataset.
 
+use super::columns::{self, Ordered, image_key};
 use super::part::{self, PartInfo};
-use super::plan::Plan;
-use super::schema::{Feature, Ordered, Schema, calibration};
 use super::stats::{ImageStats, NumberStats, QUANTILES, Stats};
 use super::table::{Kind, Layout, Table, TableWriter, Values, text};
+use crate::rows::plan::Plan;
+use crate::rows::schema::calibration;
 use crate::{Output, Parts, Source};
 use depthrig_recorder::{Error, ErrorKind, Result};
 use serde::Serialize;
@@ -43,7 +44,7 @@ pub(super) fn finish(plan: &Plan, sources: &[Source], parts: &Parts<'_>, out: &O
 /// Adds up what is known of an episode's parts.
 fn gather(plan: &Plan, sources: &[Source], source: usize, parts: &Parts<'_>) -> Result<Whole> {
     let schema = &plan.schema;
-    let numbers = schema.numbers();
+    let numbers = columns::numbers(schema);
     let mut images = vec![ImageStats::default(); schema.features.len()];
     let mut columns = vec![NumberStats::default(); numbers.len()];
     let mut bytes = 0;
@@ -56,8 +57,8 @@ fn gather(plan: &Plan, sources: &[Source], source: usize, parts: &Parts<'_>) -> 
         images.iter_mut().zip(&part.images).for_each(|(to, from)| to.merge(from));
         columns.iter_mut().zip(&part.numbers).for_each(|(to, from)| to.merge(from));
     }
-    let of_images = images.iter().zip(&schema.features).map(|(s, f)| s.finish(f.divisor()));
-    let of_columns = columns.iter().zip(&numbers).map(|(s, (name, _))| s.finish(Schema::ordered(name)));
+    let of_images = images.iter().zip(&schema.features).map(|(s, f)| s.finish(columns::divisor(f.form)));
+    let of_columns = columns.iter().zip(&numbers).map(|(s, (name, _))| s.finish(columns::ordered(name)));
     let episode = &plan.episodes[source];
     let numbers = sources[source].numbers().filter(|n| episode.row_of(*n).is_some());
     let numbers: Vec<_> = numbers.collect();
@@ -110,7 +111,7 @@ fn data_file(
         out.keep(table.bytes);
     } else {
         out.folder(&folder)?;
-        let mut data = TableWriter::new(out.create(&name)?, &name, &plan.schema.layout())?;
+        let mut data = TableWriter::new(out.create(&name)?, &name, &columns::layout(&plan.schema))?;
         let mut written = 0;
         for table in tables() {
             let Some(table) = Table::open(out, &table)? else {
@@ -147,8 +148,8 @@ fn metadata(plan: &Plan, sources: &[Source], out: &Output<'_>, episodes: &[Whole
 
 /// Features, number columns and vectors: the order of `Whole::stats`.
 fn column_names(plan: &Plan) -> Vec<String> {
-    let images = plan.schema.features.iter().map(Feature::key);
-    let numbers = plan.schema.numbers().into_iter().map(|(name, _)| name);
+    let images = plan.schema.features.iter().map(image_key);
+    let numbers = columns::numbers(&plan.schema).into_iter().map(|(name, _)| name);
     let vectors = plan.schema.vectors.iter().map(|v| v.key.to_owned());
     images.chain(numbers).chain(vectors).collect()
 }
@@ -186,7 +187,7 @@ fn info(plan: &Plan, sources: &[Source]) -> Info {
         splits: BTreeMap::from([("train", format!("0:{}", plan.episodes.len()))]),
         data_path: DATA_PATH,
         video_path: None,
-        features: plan.schema.features_json(),
+        features: columns::features_json(&plan.schema, sources),
     }
 }
 
@@ -197,7 +198,7 @@ fn calibrations(plan: &Plan, sources: &[Source]) -> Value {
         let streams = plan.schema.features.iter().filter_map(|feature| {
             let s = session.streams.iter().find(|s| s.id == feature.id)?;
             let mut entry = json!({
-                "feature": feature.key(),
+                "feature": image_key(feature),
                 "stream": s.id.to_string(),
                 "model": s.model,
                 "width": s.width,

@@ -1,10 +1,10 @@
 //! One part becomes a table of its own and the statistics of what is in it.
 
-use super::encode;
-use super::plan::{Episode, Plan};
 use super::stats::{ImageStats, NumberStats, sampled};
 use super::table::{Kind, TableWriter, Values, text};
+use super::{columns, encode};
 use crate as exchange;
+use crate::rows::plan::{Episode, Plan};
 use crate::{PartOut, PartSets, Source};
 use depthrig_recorder::{DatasetSet, Error, ErrorKind, PixelMode, Result};
 use parquet::data_type::ByteArray;
@@ -20,7 +20,7 @@ pub(super) struct PartInfo {
     pub(super) bytes: u64,
     /// By feature.
     pub(super) images: Vec<ImageStats>,
-    /// By column of `Schema::numbers`.
+    /// By column of `columns::numbers`.
     pub(super) numbers: Vec<NumberStats>,
 }
 
@@ -39,7 +39,7 @@ pub(super) fn write(
     out: &mut PartOut<'_>,
 ) -> Result<()> {
     let name = table_name(part);
-    let table = TableWriter::new(out.scratch(&name)?, &name, &plan.schema.layout())?;
+    let table = TableWriter::new(out.scratch(&name)?, &name, &columns::layout(&plan.schema))?;
     let mut rows = Rows::new(plan, part.source, table);
     let place = plan.schema.places(source);
     let mut next = part.sets.start;
@@ -102,7 +102,7 @@ struct Rows<'p, 'f> {
     table: TableWriter<'f>,
     /// By feature: images and their names of the row group in the making.
     images: Vec<(Vec<ByteArray>, Vec<ByteArray>)>,
-    /// By column of `Schema::numbers`.
+    /// By column of `columns::numbers`.
     numbers: Vec<Vec<Number>>,
     /// By vector.
     vectors: Vec<Vec<Vec<f32>>>,
@@ -115,7 +115,7 @@ struct Rows<'p, 'f> {
 impl<'p, 'f> Rows<'p, 'f> {
     fn new(plan: &'p Plan, episode_index: usize, table: TableWriter<'f>) -> Self {
         let features = plan.schema.features.len();
-        let numbers = plan.schema.numbers().len();
+        let numbers = columns::numbers(&plan.schema).len();
         Self {
             plan,
             episode: &plan.episodes[episode_index],
@@ -206,7 +206,7 @@ impl<'p, 'f> Rows<'p, 'f> {
         names.push(text(format!("frame-{row:06}.{extension}")));
     }
 
-    /// The numbers of a row, in the order of `Schema::numbers`, and its vectors.
+    /// The numbers of a row, in the order of `columns::numbers`, and its vectors.
     fn end_row(&mut self, row: u64, number: usize, facts: &SetFacts, captures: &[Option<i64>]) -> Result<()> {
         let fixed = [
             // The loader works in floats, and computes the grid as this quotient.
@@ -249,7 +249,7 @@ impl<'p, 'f> Rows<'p, 'f> {
         for (bytes, paths) in &mut self.images {
             values.push(Values::Image { bytes: std::mem::take(bytes), paths: std::mem::take(paths) });
         }
-        for ((_, kind), column) in self.plan.schema.numbers().iter().zip(&mut self.numbers) {
+        for ((_, kind), column) in columns::numbers(&self.plan.schema).iter().zip(&mut self.numbers) {
             values.push(column_values(*kind, &std::mem::take(column)));
         }
         for rows in self.vectors.iter_mut().map(std::mem::take) {

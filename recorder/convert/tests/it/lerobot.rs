@@ -2,8 +2,10 @@
 
 use crate::support::*;
 use core::ops::ControlFlow;
-use depthrig_convert::lerobot::{Incomplete, Lerobot, LerobotOptions};
-use depthrig_convert::{ByteCameraExport, CameraNames, ExportOptions, Exporter, export};
+use depthrig_convert::lerobot::Lerobot;
+use depthrig_convert::{
+    ByteCameraExport, CameraNames, ExportOptions, Exporter, Incomplete, RowOptions, export,
+};
 use depthrig_recorder::fs::{Fs, MemFs, write_all};
 use depthrig_recorder::{Episode, Recorder, SESSION_FILE};
 use std::path::Path;
@@ -20,7 +22,7 @@ fn sets_that_are_left_out_are_not_counted_as_exported() {
     }
     r.finish().unwrap();
     let incomplete = Incomplete::LeaveOut;
-    let mut lerobot = Lerobot::new(LerobotOptions { incomplete, ..LerobotOptions::default() });
+    let mut lerobot = Lerobot::new(RowOptions { incomplete, ..RowOptions::default() });
     let out = Path::new("/export");
     let on = &mut |_| ControlFlow::Continue(());
     let report = export(&fs, &mut lerobot, vec![open(&fs)], out, ExportOptions::default(), on).unwrap();
@@ -65,7 +67,7 @@ fn each_used_episode_is_one_of_the_export_and_nothing_else_is() {
         let on = &mut |_| ControlFlow::Continue(());
         export(&fs, exporter, vec![open(&fs)], Path::new(out), ExportOptions::default(), on)
     };
-    let report = export_to("/export", &mut Lerobot::new(LerobotOptions::default())).unwrap();
+    let report = export_to("/export", &mut Lerobot::new(RowOptions::default())).unwrap();
     // Sets 1 to 3, and 6.
     assert_eq!((report.sets, report.frames, report.lost), (4, 12, 0));
     assert_eq!(report.datasets.len(), 1);

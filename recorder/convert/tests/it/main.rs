@@ -3,8 +3,9 @@
 
 mod bytecamera;
 mod lerobot;
-mod lerobot_faults;
 mod rosbag;
+mod rows_faults;
+mod rows_truth;
 #[path = "../../../tests/it/support.rs"]
 #[allow(dead_code)] // the recorder's tests use the rest
 mod support;

@@ -3,8 +3,7 @@
 use super::Common;
 use clap::ValueEnum;
 use depthrig_bus::StreamId;
-use depthrig_convert::lerobot::{Incomplete, LerobotOptions};
-use depthrig_convert::{Gaps, VectorOptions};
+use depthrig_convert::{Gaps, Incomplete, RowOptions, VectorOptions};
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
@@ -68,8 +67,8 @@ enum HowIncomplete {
 
 impl Args {
     /// The options of the exporter, and the common ones.
-    pub fn options(&self) -> (LerobotOptions, &Common) {
-        let options = LerobotOptions {
+    pub fn options(&self) -> (RowOptions, &Common) {
+        let options = RowOptions {
             task: self.task.clone(),
             fps: self.fps,
             incomplete: match self.incomplete {

@@ -1,10 +1,10 @@
-//! LeRobot exports whose disk fails at each operation, or loses its power. Their content is checked in
-//! `tests/python/test_lerobot.py`, with pyarrow and the real loader.
+//! Exports of rows whose disk fails at each operation, or loses its power. Their content is checked in `tests/python/test_lerobot.py` and
+//! `test_demonstrations.py`, with readers of others.
 
 use crate::support::*;
 use core::ops::ControlFlow;
-use depthrig_convert::lerobot::{Lerobot, LerobotOptions};
-use depthrig_convert::{ExportOptions, ExportReport, export};
+use depthrig_convert::lerobot::Lerobot;
+use depthrig_convert::{ExportOptions, ExportReport, Exporter, Hdf5, RowOptions, Zarr, export};
 use depthrig_recorder::fs::{Fault, Fs, MemFs};
 use depthrig_recorder::{Dataset, ErrorKind, RecorderOptions, Result};
 use std::collections::BTreeMap;
@@ -26,10 +26,24 @@ fn two(fs: &MemFs) -> Vec<Dataset> {
     vec![open(fs), open(fs)]
 }
 
+/// An exporter of one layout, new for each run.
+type Make = fn() -> Box<dyn Exporter>;
+
+fn lerobot() -> Box<dyn Exporter> {
+    Box::new(Lerobot::new(RowOptions::default()))
+}
+
+fn zarr() -> Box<dyn Exporter> {
+    Box::new(Zarr::new(RowOptions::default()))
+}
+
+fn hdf5() -> Box<dyn Exporter> {
+    Box::new(Hdf5::new(RowOptions::default()))
+}
+
 /// Exports until `sets` sets are read; `None` is all of them.
-fn run(fs: &MemFs, datasets: Vec<Dataset>, sets: Option<u64>) -> Result<ExportReport> {
-    let mut lerobot = Lerobot::new(LerobotOptions::default());
-    export(fs, &mut lerobot, datasets, &out(), ExportOptions { workers: 1 }, &mut |p| {
+fn run(make: Make, fs: &MemFs, datasets: Vec<Dataset>, sets: Option<u64>) -> Result<ExportReport> {
+    export(fs, &mut *make(), datasets, &out(), ExportOptions { workers: 1 }, &mut |p| {
         if sets.is_some_and(|sets| p.sets >= sets) {
             ControlFlow::Break(())
         } else {
@@ -46,26 +60,46 @@ fn files(fs: &MemFs, dir: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
         .collect()
 }
 
-fn whole(source: &MemFs) -> BTreeMap<PathBuf, Vec<u8>> {
+/// Whether a file is of an export that is not complete; arrays of Zarr have hidden files of their own.
+fn is_temporary(path: &Path) -> bool {
+    let name = path.file_name().unwrap().to_str().unwrap();
+    name.starts_with('.') && !name.starts_with(".z")
+}
+
+fn whole(make: Make, source: &MemFs) -> BTreeMap<PathBuf, Vec<u8>> {
     let fs = copy(source);
-    let report = run(&fs, two(&fs), None).unwrap();
+    let report = run(make, &fs, two(&fs), None).unwrap();
     let files = files(&fs, &out());
     assert_eq!((report.sets, report.lost, report.files as usize), (12, 0, files.len() - 1));
-    assert!(files.keys().all(|p| !p.display().to_string().contains("/.")), "{:?}", files.keys());
+    assert!(!files.keys().any(|p| is_temporary(p)), "{:?}", files.keys());
     files
 }
 
 #[test]
 fn an_export_to_lerobot_survives_a_failure_of_any_operation() {
+    survives_failures(lerobot);
+}
+
+#[test]
+fn an_export_to_zarr_survives_a_failure_of_any_operation() {
+    survives_failures(zarr);
+}
+
+#[test]
+fn an_export_to_hdf5_survives_a_failure_of_any_operation() {
+    survives_failures(hdf5);
+}
+
+fn survives_failures(make: Make) {
     let source = dataset();
-    let expected = whole(&source);
+    let expected = whole(make, &source);
     let mut failures = 0;
     for n in 0.. {
         let fs = copy(&source);
         let datasets = two(&fs);
         let at = fs.ops() + n;
         let fs = fs.with_fault(Fault::FailOnce(at, std::io::ErrorKind::Other));
-        let result = run(&fs, datasets, None);
+        let result = run(make, &fs, datasets, None);
         if at >= fs.ops() {
             result.unwrap();
             break;
@@ -80,28 +114,42 @@ fn an_export_to_lerobot_survives_a_failure_of_any_operation() {
         }
         if fs.read_dir(&out()).is_ok() {
             let left = files(&fs, &out());
-            for (path, bytes) in left.iter().filter(|(p, _)| !p.display().to_string().contains("/.")) {
+            for (path, bytes) in left.iter().filter(|(p, _)| !is_temporary(p)) {
                 assert_eq!(bytes, &expected[path], "operation {n} left {} in pieces", path.display());
             }
         }
-        run(&fs, two(&fs), None).unwrap_or_else(|e| panic!("after operation {n} failed: {e}"));
+        run(make, &fs, two(&fs), None).unwrap_or_else(|e| panic!("after operation {n} failed: {e}"));
         assert!(files(&fs, &out()) == expected, "after operation {n} failed");
     }
-    assert!(failures > 100, "only {failures} operations");
+    assert!(failures > 50, "only {failures} operations");
 }
 
 #[test]
 fn an_export_to_lerobot_survives_a_power_cut() {
+    survives_power_cuts(lerobot);
+}
+
+#[test]
+fn an_export_to_zarr_survives_a_power_cut() {
+    survives_power_cuts(zarr);
+}
+
+#[test]
+fn an_export_to_hdf5_survives_a_power_cut() {
+    survives_power_cuts(hdf5);
+}
+
+fn survives_power_cuts(make: Make) {
     let source = dataset();
-    let expected = whole(&source);
+    let expected = whole(make, &source);
     let mut ended = 0;
     for sets in 1..12 {
         let fs = copy(&source);
         // The last ones may be over before they are asked to end.
-        ended += u32::from(run(&fs, two(&fs), Some(sets)).unwrap().ended);
+        ended += u32::from(run(make, &fs, two(&fs), Some(sets)).unwrap().ended);
         // Nothing unsynced is left.
         let fs = fs.after_crash(|_| 0);
-        run(&fs, two(&fs), None).unwrap();
+        run(make, &fs, two(&fs), None).unwrap();
         assert!(files(&fs, &out()) == expected, "power cut after {sets} sets");
     }
     assert!(ended > 5, "{ended} exports were ended");

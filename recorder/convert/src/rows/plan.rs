@@ -1,7 +1,7 @@
 //! The plan made before an image is read: how many rows there will be, at which rate, of which tasks.
 
 use super::schema::Schema;
-use super::{Incomplete, LerobotOptions};
+use super::{Incomplete, RowOptions};
 use crate::Source;
 use crate::vectors::Moments;
 use depthrig_bus::StreamId;
@@ -21,7 +21,7 @@ pub(crate) struct Plan {
     pub(crate) losses: Vec<String>,
 }
 
-/// A dataset, or one of its episodes, as an episode of LeRobot.
+/// A dataset, or one of its episodes, as an episode of the export.
 #[derive(Debug, Clone)]
 pub(crate) struct Episode {
     pub(crate) task: usize,
@@ -110,12 +110,12 @@ fn incomplete(source: &Source, schema: &Schema) -> Result<Vec<usize>> {
 /// The options of an exporter with these rows, and its plan once it is made.
 #[derive(Debug, Default)]
 pub(crate) struct Planned {
-    pub(crate) options: LerobotOptions,
+    pub(crate) options: RowOptions,
     plan: Option<Plan>,
 }
 
 impl Planned {
-    pub(crate) const fn new(options: LerobotOptions) -> Self {
+    pub(crate) const fn new(options: RowOptions) -> Self {
         Self { options, plan: None }
     }
 
@@ -138,7 +138,7 @@ impl Planned {
 
 impl Plan {
     /// Decides how `sources` are exported; reads sets, without images, only where incomplete ones are left out.
-    pub(crate) fn make(sources: &[Source], options: &LerobotOptions) -> Result<Self> {
+    pub(crate) fn make(sources: &[Source], options: &RowOptions) -> Result<Self> {
         let bad = |message: String| Error::new(ErrorKind::BadInput, message);
         let wanted = |id: &StreamId| options.streams.is_empty() || options.streams.contains(id);
         for id in &options.streams {
@@ -192,15 +192,15 @@ impl Plan {
             let fps = *fps.get_or_insert(here);
             if (here / fps - 1.0).abs() > 1e-3 {
                 return Err(bad(format!(
-                    "{name} has {here} sets per second, the first dataset {fps}: LeRobot has one rate for all \
-                     episodes; export them separately or give the rate"
+                    "{name} has {here} sets per second, the first dataset {fps}: all episodes of an export have one \
+                     rate; export them separately or give the rate"
                 )));
             }
             let (gaps, missing) = gaps(&kept, fps);
             if gaps > 0 {
                 plan.losses.push(format!(
-                    "{session}: {gaps} gaps in time ({missing} sets) are closed by the even grid of timestamp; \
-                     capture.utc_ns has the true times"
+                    "{session}: {gaps} gaps in time ({missing} sets) are closed by the even grid of rows; \
+                     capture.utc_ns (utc_ns) has the true times"
                 ));
             }
             first_row += rows;
@@ -222,7 +222,7 @@ fn named(source: &Source) -> String {
     format!("{}{number}", source.session().name)
 }
 
-/// LeRobot's task is a sentence: that of the episode; else the scene is the nearest that a session has.
+/// The task is a sentence: that of the episode; else the scene is the nearest that a session has.
 fn task_of(source: &Source) -> String {
     if let Some(task) = source.episode().map(|e| e.task.trim()).filter(|t| !t.is_empty()) {
         return task.to_owned();
