@@ -120,7 +120,7 @@ fn constants(out: &mut String) {
     for (name, value) in external_constants() {
         out.push_str(&format!("EXTERNAL_{name} = {value}\n"));
     }
-    out.push_str("\n# Signals: docs/demonstrations.md\n");
+    out.push_str("\n# Signals: docs/signals.md\n");
     for (name, value) in signal_constants() {
         out.push_str(&format!("SIGNAL_{name} = {value}\n"));
     }

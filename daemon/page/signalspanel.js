@@ -14,7 +14,7 @@ const LONG_LABEL = 13;
 /** An answer that does not come for so long is lost. */
 const LOST_MS = 3000;
 const MAX_SHOWN = 64;
-const NONE = "No signals. A robot's program publishes them with depthrig.Signal: docs/demonstrations.md.";
+const NONE = "No signals. A robot's program publishes them with depthrig.Signal: docs/signals.md.";
 
 /** One signal. */
 class Card {

@@ -620,8 +620,8 @@ with tempfile.TemporaryDirectory(dir="/tmp") as folder:
 
 
 def test_the_examples_of_the_documents_run(folder: Path) -> None:
-    """Each block of Python in docs/demonstrations.md that needs no rig, in order, as one program."""
-    text = (ROOT / "docs" / "demonstrations.md").read_text().partition("\n## Episodes\n")[0]
+    """Each block of Python in docs/signals.md, in order, as one program."""
+    text = (ROOT / "docs" / "signals.md").read_text()
     blocks = [part.split("```", 1)[0] for part in text.split("```python\n")[1:]]
     assert blocks
     environment = {**os.environ, _layout.RUNTIME_DIR_VARIABLE: str(folder)}

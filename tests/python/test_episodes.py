@@ -156,7 +156,7 @@ def test_a_python_program_steers_its_recording_and_episodes(
             recording.mark_episode("perhaps")
         assert recording.mark_episode("success", 1).outcome == "success"
         # As the documents have it.
-        text = (ROOT / "docs" / "demonstrations.md").read_text().partition("\n## Episodes\n")[2]
+        text = (ROOT / "docs" / "episodes.md").read_text()
         (code,) = [block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "Recording()" in block]
         code = code.replace("Recording()", "Recording(runtime_dir=folder)")
         assert recording.start_episode("to the end").number == 3

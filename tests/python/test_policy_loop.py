@@ -271,7 +271,7 @@ def test_a_loop_without_samples_does_not_act(binary: str, runtime: Path, rig: Pa
 
 
 def test_the_example_of_the_documents_runs(binary: str, runtime: Path, rig: Path) -> None:
-    text = (ROOT / "docs" / "demonstrations.md").read_text().partition("\n## In a policy\n")[2]
+    text = (ROOT / "docs" / "policies.md").read_text()
     (code, *_) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     code = code.replace("seconds=60", "seconds=60, steps=3").replace("max_age=0.5, max_gap=0.1", "max_age=60, max_gap=60, wait=60, max_skew=1")
     path = str(Path(depthrig.__file__).parents[1])

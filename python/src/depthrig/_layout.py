@@ -58,7 +58,7 @@ EXTERNAL_EVENT_ID = 1
 EXTERNAL_RIG_VARIABLE = "DEPTHRIG_RIG"
 EXTERNAL_CAMERA_VARIABLE = "DEPTHRIG_CAMERA"
 
-# Signals: docs/demonstrations.md
+# Signals: docs/signals.md
 SIGNAL_VERSION = 1
 SIGNAL_SCHEMA = "depthrig.signal/1"
 SIGNAL_PREFIX = "depthrig.signal"

@@ -7,8 +7,8 @@
 //! All addresses are known before the first byte is written, so a file is written front to back, through the same file system as every other
 //! file of an export. Superblock 2, headers 2 and B-trees 1 are read by every HDF5 from 1.8 (2008) on.
 //!
-//! Why not a crate: `hdf5-metno` builds or links the C library; `rust-hdf5` 0.7 and `hdf5-pure` 0.47 are pure Rust, but change monthly, have up to 100,000
-//! lines for reading and editing too, and write to a path of the real disk, in no order, past [`depthrig_recorder::fs`] and its tests of faults.
+//! Why not a crate: `hdf5-metno` builds or links the C library. `rust-hdf5` 0.7 and `hdf5-pure` 0.47 are pure Rust and young; they read and edit as well, in many times
+//! the code, and write to a path of the real disk, past [`depthrig_recorder::fs`] and its tests of faults.
 
 use super::checksum::lookup3;
 
