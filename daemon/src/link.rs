@@ -75,11 +75,7 @@ impl Link {
                 Role::Recorder { answerer: Answerer::start(at).map_err(|e| failed(e, what()))?, clock }
             }
             LinkRole::Camera(at) => {
-                let what = || {
-                    format!(
-                        "there is no route to {at}; recorder in [link] must be an address of the recorder's computer"
-                    )
-                };
+                let what = || format!("the clock of {at} cannot be asked for");
                 Role::Camera(Asker::start(at).map_err(|e| failed(e, what()))?)
             }
         };
@@ -94,7 +90,7 @@ impl Link {
         }
     }
 
-    /// How it goes.
+    /// The state of this computer's part.
     pub fn status(&self, now: HostTime) -> LinkStatus {
         let host = self.config.host.to_string();
         match &self.role {

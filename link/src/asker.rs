@@ -19,7 +19,7 @@ const EVERY: Duration = Duration::from_millis(50);
 /// Questions whose answers may still come: two seconds.
 const OUTSTANDING: usize = 40;
 
-/// How it goes with the other host's clock.
+/// State of the exchange with the other host.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
 #[non_exhaustive]
 pub struct AskerState {
@@ -54,18 +54,13 @@ struct Shared {
 }
 
 impl Asker {
-    /// Asks the host at `address`, whether it answers yet or not.
+    /// Asks the host at `address`, whether it answers yet, or can be reached yet, or not.
     ///
     /// # Errors
-    /// When the kernel knows no route to it, or no thread can be started.
+    /// When no thread can be started.
     pub fn start(address: SocketAddr) -> io::Result<Self> {
-        let any: SocketAddr =
-            if address.is_ipv4() { "0.0.0.0:0" } else { "[::]:0" }.parse().map_err(io::Error::other)?;
-        let socket = UdpSocket::bind(any)?;
-        // The kernel hands over packets of this host alone.
-        socket.connect(address)?;
         let random = File::open("/dev/urandom")?;
-        let asking = Asking { socket: Stamped::new(socket)?, random, outstanding: VecDeque::new() };
+        let asking = Asking { address, socket: None, random, outstanding: VecDeque::new() };
         let shared = Arc::new(Shared::default());
         let of_thread = Arc::clone(&shared);
         let thread = std::thread::Builder::new()
@@ -84,7 +79,7 @@ impl Asker {
         self.address
     }
 
-    /// How it goes.
+    /// State of the exchange.
     pub fn state(&self) -> AskerState {
         lock(&self.shared.clock).1
     }
@@ -100,7 +95,9 @@ impl Drop for Asker {
 }
 
 struct Asking {
-    socket: Stamped,
+    address: SocketAddr,
+    /// None until there is a route to the host.
+    socket: Option<Stamped>,
     random: File,
     /// Questions without an answer, and when they were sent.
     outstanding: VecDeque<([u8; 16], HostTime)>,
@@ -112,13 +109,18 @@ impl Asking {
         while !shared.stop.load(Ordering::Relaxed) {
             next = next.plus(EVERY).max(HostTime::now());
             if let Err(e) = self.ask(shared) {
-                tracing::debug!("the clock of the other host is not asked: {e}");
+                tracing::debug!("the clock of {} is not asked: {e}", self.address);
             }
             while self.wait(shared, next) {}
         }
     }
 
     fn ask(&mut self, shared: &Shared) -> io::Result<()> {
+        let socket = match self.socket.take() {
+            Some(socket) => socket,
+            None => connected(self.address)?,
+        };
+        let socket = self.socket.insert(socket).socket();
         let mut nonce = [0; 16];
         self.random.read_exact(&mut nonce)?;
         if self.outstanding.len() == OUTSTANDING {
@@ -128,7 +130,7 @@ impl Asking {
         lock(&shared.clock).1.asked += 1;
         let sent = HostTime::now();
         self.outstanding.push_back((nonce, sent));
-        self.socket.socket().send(&question).map(drop)
+        socket.send(&question).map(drop)
     }
 
     /// Waits for a packet until it is time for the next question; `false` when it is.
@@ -138,13 +140,15 @@ impl Asking {
             return false;
         }
         let mut buffer = [0; LENGTH];
-        let received =
-            self.socket.socket().set_read_timeout(Some(left)).and_then(|()| self.socket.receive(&mut buffer));
+        let received = match &mut self.socket {
+            Some(s) => s.socket().set_read_timeout(Some(left)).and_then(|()| s.receive(&mut buffer)),
+            None => Err(io::ErrorKind::NotConnected.into()),
+        };
         let received = match received {
             Ok(Some(received)) => received,
             Ok(None) => return false,
             Err(_) => {
-                // Nobody listens there yet.
+                // The host cannot be reached, or nobody listens there yet.
                 std::thread::sleep(next.from_now());
                 return false;
             }
@@ -173,5 +177,88 @@ impl Asking {
             }
         }
         true
+    }
+}
+
+/// A socket to `address` alone: the kernel hands over packets of that host and port, and no others.
+fn connected(address: SocketAddr) -> io::Result<Stamped> {
+    let any = if address.is_ipv4() { "0.0.0.0:0" } else { "[::]:0" };
+    let socket = UdpSocket::bind(any)?;
+    socket.connect(address)?;
+    Stamped::new(socket)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Answerer;
+
+    fn until(what: impl Fn() -> bool) {
+        for _ in 0..600 {
+            if what() {
+                return;
+            }
+            std::thread::sleep(Duration::from_millis(50));
+        }
+        panic!("it does not come");
+    }
+
+    #[test]
+    fn a_host_may_come_late_go_and_come_back() {
+        let place = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+        let asker = Asker::start(place).unwrap();
+        until(|| asker.state().asked >= 2);
+        assert_eq!(asker.at(HostTime::now()), None);
+        let answerer = Answerer::start(place).unwrap();
+        until(|| asker.state().answered >= 5);
+        let first = asker.at(HostTime::now()).unwrap();
+        // It is the same clock.
+        assert!(first.offset_ns.unsigned_abs() <= first.uncertainty_ns, "{first:?}");
+        drop(answerer);
+        let before = asker.state();
+        until(|| asker.state().asked >= before.asked + 5);
+        let again = Answerer::start(place).unwrap();
+        until(|| asker.state().answered >= before.answered + 10);
+        let back = asker.at(HostTime::now()).unwrap();
+        assert_eq!(back.epoch, 1);
+        assert!(again.answered() >= 5);
+    }
+
+    #[test]
+    fn a_host_without_a_route_is_asked_again_and_again() {
+        // Nothing is sent to this network, which documents alone use; a computer without a route to it says so at once.
+        let asker = Asker::start("[2001:db8::1]:7447".parse().unwrap()).unwrap();
+        std::thread::sleep(Duration::from_millis(300));
+        assert_eq!(asker.at(HostTime::now()), None);
+    }
+
+    #[test]
+    fn packets_that_answer_nothing_are_counted_and_change_nothing() {
+        let host = UdpSocket::bind("127.0.0.1:0").unwrap();
+        host.set_read_timeout(Some(Duration::from_secs(30))).unwrap();
+        let asker = Asker::start(host.local_addr().unwrap()).unwrap();
+        let mut buffer = [0; 100];
+        let (length, from) = host.recv_from(&mut buffer).unwrap();
+        let nonce = Question::from_bytes(&buffer[..length]).unwrap().nonce;
+        let good = Answer { nonce, clock: 7, t2: 5, t3: 5 };
+        let guessed = Answer { nonce: [1; 16], ..good };
+        let untrue = Answer { t2: 9, ..good };
+        for packet in
+            [b"x".to_vec(), buffer.to_vec(), guessed.to_bytes().to_vec(), untrue.to_bytes().to_vec()]
+        {
+            host.send_to(&packet, from).unwrap();
+        }
+        // Its question is answered, although not with the truth.
+        host.send_to(&good.to_bytes(), from).unwrap();
+        until(|| asker.state().refused == 5);
+        assert_eq!(asker.at(HostTime::now()), None);
+        // Another port of the same host is not heard.
+        UdpSocket::bind("127.0.0.1:0").unwrap().send_to(&good.to_bytes(), from).unwrap();
+        let (length, from) = host.recv_from(&mut buffer).unwrap();
+        let nonce = Question::from_bytes(&buffer[..length]).unwrap().nonce;
+        host.send_to(&Answer { nonce, ..good }.to_bytes(), from).unwrap();
+        until(|| asker.state().answered == 1);
+        assert_eq!(asker.state().refused, 5);
+        assert!(asker.at(HostTime::now()).is_some());
     }
 }

@@ -30,8 +30,8 @@ const RECENT: usize = 64;
 const STEPS: usize = 40;
 /// An exchange that took longer says nothing that the corridor needs.
 const LONGEST: Duration = Duration::from_secs(2);
-/// Times beyond this many nanoseconds (146 years) are nonsense, and sums of them could overflow.
-const FAR_NS: i64 = i64::MAX / 2;
+/// Times beyond this many nanoseconds (36 years) are nonsense, and sums of them could overflow.
+const FAR_NS: i64 = i64::MAX / 8;
 
 /// Four stamps of one question and its answer, each on the `CLOCK_MONOTONIC` of the host that took it, nanoseconds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -191,6 +191,30 @@ fn stamps_that_cannot_be_true_change_nothing() {
     check(&corridor, 4_000.0, 1_200);
 }
 
+proptest! {
+    #[test]
+    fn no_stamps_harm_it(
+        stamps in prop::collection::vec((any::<i64>(), any::<i64>(), any::<i64>(), any::<i64>(), 0u8..8), 1..80),
+    ) {
+        let mut corridor = Corridor::default();
+        let mut last = 0i64;
+        for (a, b, c, d, kind) in stamps {
+            // Some of them can be true, as far as one exchange shows.
+            let t1 = last.saturating_add(a.rem_euclid(1_000_000_000));
+            let (t2, on_way) = (b / i64::from(kind.max(1)), c.rem_euclid(1_000_000_000));
+            let e = match kind {
+                0 => Exchange { t1: a, t2: b, t3: c, t4: d },
+                _ => Exchange { t1, t2, t3: t2, t4: t1.saturating_add(on_way) },
+            };
+            if corridor.take(e) != Taken::Refused {
+                last = e.t1;
+            }
+            corridor.at(HostTime::from_ns(d));
+            corridor.at(HostTime::from_ns(last));
+        }
+    }
+}
+
 #[test]
 fn without_answers_the_uncertainty_grows() {
     let clocks = Clocks { offset: 0, rate: 0.0 };
