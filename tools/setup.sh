@@ -66,6 +66,9 @@ for part in "$@"; do
         need chromium command -v chromium
         # The boxes that tests run in.
         need util-linux command -v setpriv
+        # Two computers out of one; an ordinary user's PATH may lack /usr/sbin.
+        need iproute2 test -x /usr/sbin/tc
+        need procps command -v pgrep
         ;;
     vm)
         need qemu-system-x86 command -v qemu-system-x86_64

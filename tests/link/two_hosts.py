@@ -9,6 +9,7 @@ wire both ways with TCP. Needs no privilege but a user namespace.
 
 import argparse
 import contextlib
+import os
 import socket
 import subprocess
 import sys
@@ -75,6 +76,7 @@ def main() -> int:
     parser.add_argument("--load", action="store_true")
     parser.add_argument("programs", nargs=argparse.REMAINDER)
     options = parser.parse_args()
+    os.environ["PATH"] += ":/usr/sbin:/sbin"  # where an ordinary user may not look
     cut = options.programs.index("--")
     there, here = options.programs[:cut], options.programs[cut + 1 :]
     enter = [sys.executable, "-c", ENTER, str(options.shift), "unshare", "-np", "--fork", "--kill-child"]

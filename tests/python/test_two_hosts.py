@@ -14,7 +14,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from test_daemon import CAMERAS, DATA, ROOT, WAIT_S, binary, command, environment, runtime  # noqa: F401
-from test_link_clock import HOSTS, SHIFT_NS
+from test_link_clock import HOSTS, SHIFT_NS, namespaces
 
 HOST_CAMERAS = {"right": CAMERAS[:3], "left": CAMERAS[3:]}
 LINKS = {"right": 'listen = "10.77.0.1:7447"', "left": 'recorder = "10.77.0.1:7447"'}
@@ -44,8 +44,7 @@ def messages(dataset: Path) -> Iterator[tuple[str, Any, bytes]]:
 def datasets(binary: str, runtime: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:  # noqa: F811
     """A recording of each host, and both joined."""
     folder = tmp_path_factory.mktemp("hosts")
-    if subprocess.run(["unshare", "-UrnT", "ip", "link"], capture_output=True, check=False).returncode != 0:
-        pytest.skip("this computer gives an ordinary user no namespaces")
+    namespaces()
     scripts = {}
     for host in HOST_CAMERAS:
         own = runtime / host
