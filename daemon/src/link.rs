@@ -9,6 +9,7 @@ use crate::config::{LinkConfig, LinkRole};
 use crate::status::{LinkState, LinkStatus};
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
+use depthrig_bus::signal::LINK_CLOCK;
 use depthrig_bus::{
     FieldType, HostTime, RuntimeDir, SignalDescription, SignalField, SignalName, SignalPublisher,
     SignalSample, Signals, Value,
@@ -21,8 +22,6 @@ use std::sync::atomic::{AtomicBool, Ordering};
 const EVERY: Duration = Duration::from_millis(100);
 /// Without an answer for so long, the other computer is silent.
 const SILENT_NS: i64 = 2_000_000_000;
-/// The signal's name behind that of the host.
-const SIGNAL: &str = "link_clock";
 /// Its fields, in the order of the values.
 const FIELDS: [(&str, FieldType, &str); 5] = [
     ("clock", FieldType::I64, ""),
@@ -148,7 +147,7 @@ impl Link {
     /// Those of opening a channel; [`ErrorKind::InUse`] when another rig of this computer has this host's name.
     pub fn publisher(&self, runtime: &RuntimeDir) -> Result<ClockPublisher> {
         let place = Signals::open(runtime)?;
-        let name: SignalName = format!("{}/{SIGNAL}", self.config.host).parse()?;
+        let name: SignalName = format!("{}/{LINK_CLOCK}", self.config.host).parse()?;
         let description = SignalDescription::fields(
             name,
             FIELDS.map(|(name, kind, unit)| SignalField::new(name, kind, unit)).into(),
@@ -219,7 +218,7 @@ pub fn is_clock(description: &SignalDescription) -> bool {
     let same = |(field, (name, kind, _)): (&SignalField, &(&str, FieldType, &str))| {
         field.name == *name && field.kind == *kind && field.count == 1
     };
-    description.name().signal().as_str() == SIGNAL
+    description.name().signal().as_str() == LINK_CLOCK
         && description.all_fields().len() == FIELDS.len()
         && description.all_fields().iter().zip(&FIELDS).all(same)
 }

@@ -129,3 +129,33 @@ def test_times_are_those_of_the_session_within_the_uncertainty(datasets: dict[st
     for topic, locals_ in frames("right").items():
         assert [v.capture_time_ns for v in joined[topic]] == [v.capture_time_ns for v in locals_]
     assert checked > 100
+
+
+def test_a_joined_dataset_is_on_the_clock_of_the_session_already(
+    binary: str,  # noqa: F811
+    runtime: Path,  # noqa: F811
+    datasets: dict[str, Path],
+    tmp_path: Path,
+) -> None:
+    def times(dataset: Path) -> list[tuple[str, int]]:
+        return [(t, v.capture_time_ns) for t, v, _ in messages(dataset) if t.endswith("/frame_info")]
+
+    parts = [tmp_path / "begin", tmp_path / "end"]
+    for part, span in zip(parts, (["--to", "4"], ["--from", "4.05"]), strict=True):
+        command(binary, runtime, "trim", str(datasets["joined"]), str(part), *span)
+    join = ["replay", *map(str, parts), "--as-fast-as-possible", "-q", "--force", "--record", str(tmp_path / "again")]
+    command(binary, runtime, *join)
+    (again,) = (tmp_path / "again").iterdir()
+    assert sorted(times(again)) == sorted(times(parts[0]) + times(parts[1]))
+
+
+def test_the_clock_is_no_state_of_a_robot(
+    binary: str,  # noqa: F811
+    runtime: Path,  # noqa: F811
+    datasets: dict[str, Path],
+    tmp_path: Path,
+) -> None:
+    command(binary, runtime, "export", "lerobot", str(datasets["right"]), str(tmp_path / "out"), "--incomplete", "leave-out")
+    features = json.loads((tmp_path / "out" / "meta" / "info.json").read_text())["features"]
+    assert any(name.startswith("observation.images") for name in features)
+    assert "observation.state" not in features

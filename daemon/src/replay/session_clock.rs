@@ -5,6 +5,7 @@
 
 use crate::link::{self, ClockSample};
 use depthrig_bus::HostTime;
+use depthrig_link::Reading;
 use depthrig_recorder::{PixelMode, Session, SetReader};
 
 /// How fast two crystals may part beyond the last sample, per nanosecond.
@@ -38,8 +39,15 @@ pub struct SessionClock {
 
 impl SessionClock {
     /// That of a dataset, whose sets are read without their images; `None` for a dataset of one computer, or if several clocks took turns.
+    ///
+    /// A dataset with the signals of several computers is one that was joined: its times are on the session's clock already.
     pub fn of(session: &Session, reader: &mut SetReader) -> Option<Self> {
-        let signal = session.signals.iter().position(|s| link::is_clock(&s.description))?;
+        let signals = session.signals.iter().enumerate();
+        let signals: Vec<_> =
+            signals.filter(|(_, s)| link::is_clock(&s.description)).map(|(i, _)| i).collect();
+        if signals.is_empty() {
+            return None;
+        }
         let mut samples: Vec<ClockSample> = Vec::new();
         // Of each set its tick and the offset to UTC; of one that cannot be read those of the set before.
         let mut ticks: Vec<(HostTime, i64)> = Vec::new();
@@ -50,12 +58,16 @@ impl SessionClock {
                 continue;
             };
             ticks.push((set.tick, set.utc_offset_ns));
-            let of_clock = set.signals.iter().filter(|s| s.signal == signal);
+            let of_clock = set.signals.iter().filter(|s| signals.contains(&s.signal));
             samples.extend(of_clock.flat_map(|s| &s.samples).filter_map(link::read));
         }
         let clock = samples.first()?.clock;
         if samples.iter().any(|s| s.clock != clock) {
             return None;
+        }
+        if signals.len() > 1 {
+            let own = Reading { offset_ns: 0, uncertainty_ns: 0, rate: 0.0, epoch: 1 };
+            samples.iter_mut().for_each(|s| s.reading = own);
         }
         samples.sort_by_key(|s| s.time);
         let mut begun = None;
@@ -106,7 +118,6 @@ fn place(tick: HostTime, samples: &[ClockSample]) -> Option<(u32, Place)> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use depthrig_link::Reading;
 
     fn sample(time_ms: i64, offset_ns: i64, epoch: u32) -> ClockSample {
         let reading = Reading { offset_ns, uncertainty_ns: 1000, rate: 1e-4, epoch };

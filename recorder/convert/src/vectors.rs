@@ -4,6 +4,7 @@
 
 use crate::Source;
 use core::time::Duration;
+use depthrig_bus::signal::LINK_CLOCK;
 use depthrig_bus::{FieldType, HostTime, Series, SignalHeader, SignalSample, StreamId, Value};
 use depthrig_recorder::{Error, ErrorKind, PixelMode, Result, SignalRecord};
 use serde::Serialize;
@@ -79,7 +80,9 @@ impl Vector {
         let of = |ids: &[StreamId], action: bool| match ids {
             [] => {
                 // By name: the session has them in the order in which they appeared.
-                let mut found: Vec<_> = all.iter().filter(|s| is_action(&s.id) == action).cloned().collect();
+                let is_robots = |s: &&SignalRecord| s.id.stream.as_str() != LINK_CLOCK;
+                let of_kind = |s: &&SignalRecord| is_action(&s.id) == action;
+                let mut found: Vec<_> = all.iter().filter(is_robots).filter(of_kind).cloned().collect();
                 found.sort_by(|a, b| a.id.cmp(&b.id));
                 Ok(found)
             }
