@@ -54,7 +54,7 @@ use core::time::Duration;
 pub const SCHEMA: &str = "depthrig.signal/1";
 /// First part of the channels' names. No rig can have it, since names of rigs have no dot.
 pub const PREFIX: &str = "depthrig.signal";
-/// Second part of the name of the signal by which a daemon states the clock of a session of several computers. It is no state of a robot.
+/// Second part of the name of the signal by which a daemon states the clock of a session of several computers. Exports leave it out.
 pub const LINK_CLOCK: &str = "link_clock";
 /// Suffix of a signal's lock file, which its publisher holds.
 pub const LOCK_SUFFIX: &str = ".signal";
