@@ -51,7 +51,7 @@ def text(page: Path) -> str:
 def test_the_reference_has_every_command(binary: str, site: Path, tmp_path: Path) -> None:
     subprocess.run([binary, "man", "--out", tmp_path], timeout=WAIT_S, check=True)
     pages = "\n".join(text(page) for page in (site / "docs/reference/commands").glob("*.html"))
-    found = {line.replace(" ", "-") for line in re.findall(r"^ *(depthrig [a-z -]+)$", pages, re.MULTILINE)}
+    found = {line.replace(" ", "-") for line in re.findall(r"^ *(depthrig [a-z0-9 -]+)$", pages, re.MULTILINE)}
     missing = {page.stem for page in tmp_path.glob("depthrig-*.1")} - found
     assert not missing, missing
     assert len(list(tmp_path.glob("depthrig-*.1"))) > 50

@@ -95,7 +95,7 @@ class OtherClock:
                 answer = bytearray(self.back.recv(100))
             except TimeoutError:
                 continue
-            for at in (32, 40):
+            for at in (40, 48):
                 (stamp,) = struct.unpack_from("<q", answer, at)
                 struct.pack_into("<q", answer, at, stamp + round(self.offset_at(stamp)))
             time.sleep(chance.choice([0.0, 0.0, 0.001, 0.003]))
