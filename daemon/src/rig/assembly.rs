@@ -77,6 +77,8 @@ impl Assembly {
             let deadline = self.assembler.as_ref().and_then(Assembler::next_deadline);
             let sleep = deadline.map_or(IDLE, |d| d.from_now().min(IDLE)).max(Duration::from_millis(1));
             self.inner.shared.frames.wait(sleep);
+            // Before the first frame, which decides on the first tick.
+            self.align(HostTime::now());
             self.read_frames();
             self.motion.read(&self.inner);
             self.late_streams.read();
@@ -183,7 +185,6 @@ impl Assembly {
 
     fn send_sets(&mut self) {
         let now = HostTime::now();
-        self.align(now);
         while let Some(set) = self.assembler.as_mut().and_then(|a| a.poll(now)) {
             self.send(set);
         }
