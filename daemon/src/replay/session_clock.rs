@@ -67,7 +67,9 @@ impl SessionClock {
         }
         if signals.len() > 1 {
             let own = Reading { offset_ns: 0, uncertainty_ns: 0, rate: 0.0, epoch: 1 };
-            samples.iter_mut().for_each(|s| s.reading = own);
+            for sample in &mut samples {
+                sample.reading = own;
+            }
         }
         samples.sort_by_key(|s| s.time);
         let mut begun = None;
