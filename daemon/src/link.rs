@@ -66,15 +66,12 @@ impl Link {
         let role = match config.role {
             LinkRole::Recorder(at) => {
                 let clock = of_this_clock().map_err(|e| failed(e, "this computer's clock".to_owned()))?;
-                let what = || {
-                    format!(
-                        "UDP {at} cannot be listened on; listen in [link] must be an address of this computer"
-                    )
-                };
+                let what =
+                    || format!("UDP {at} is refused; listen in [link] must be an address of this computer");
                 Role::Recorder { answerer: Answerer::start(at).map_err(|e| failed(e, what()))?, clock }
             }
             LinkRole::Camera(at) => {
-                let what = || format!("the clock of {at} cannot be asked for");
+                let what = || format!("no thread asks for the clock of {at}");
                 Role::Camera(Asker::start(at).map_err(|e| failed(e, what()))?)
             }
         };

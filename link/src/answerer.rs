@@ -3,15 +3,15 @@
 use crate::identity::of_this_clock;
 use crate::stamped::Stamped;
 use crate::wire::{Answer, LENGTH, Question};
+use crate::worker::Worker;
 use core::time::Duration;
 use depthrig_bus::HostTime;
 use std::io;
 use std::net::{SocketAddr, UdpSocket};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::thread::JoinHandle;
 
-/// How long the thread waits at most before it looks whether to stop.
+/// The thread looks this often whether to stop.
 const LOOK: Duration = Duration::from_millis(100);
 /// Questions of all hosts that are answered in a second: fifty hosts at 20 Hz. A flood costs no more than that.
 const PER_SECOND: u64 = 1000;
@@ -19,14 +19,13 @@ const PER_SECOND: u64 = 1000;
 /// A thread that answers until this is dropped.
 #[derive(Debug)]
 pub struct Answerer {
-    shared: Arc<Shared>,
+    counts: Arc<Counts>,
     address: SocketAddr,
-    thread: Option<JoinHandle<()>>,
+    _thread: Worker,
 }
 
 #[derive(Debug, Default)]
-struct Shared {
-    stop: AtomicBool,
+struct Counts {
     answered: AtomicU64,
     refused: AtomicU64,
 }
@@ -42,12 +41,10 @@ impl Answerer {
         let address = socket.local_addr()?;
         let socket = Stamped::new(socket)?;
         let clock = of_this_clock()?;
-        let shared = Arc::new(Shared::default());
-        let of_thread = Arc::clone(&shared);
-        let thread = std::thread::Builder::new()
-            .name("link_answers".to_owned())
-            .spawn(move || answer(socket, clock, &of_thread))?;
-        Ok(Self { shared, address, thread: Some(thread) })
+        let counts = Arc::new(Counts::default());
+        let of_thread = Arc::clone(&counts);
+        let thread = Worker::start("link_answers", move |stop| answer(socket, clock, &of_thread, stop))?;
+        Ok(Self { counts, address, _thread: thread })
     }
 
     /// Where it listens.
@@ -57,29 +54,20 @@ impl Answerer {
 
     /// Questions answered so far.
     pub fn answered(&self) -> u64 {
-        self.shared.answered.load(Ordering::Relaxed)
+        self.counts.answered.load(Ordering::Relaxed)
     }
 
     /// Packets that were no question, or came above the limit.
     pub fn refused(&self) -> u64 {
-        self.shared.refused.load(Ordering::Relaxed)
+        self.counts.refused.load(Ordering::Relaxed)
     }
 }
 
-impl Drop for Answerer {
-    fn drop(&mut self) {
-        self.shared.stop.store(true, Ordering::Relaxed);
-        if let Some(thread) = self.thread.take() {
-            let _ = thread.join();
-        }
-    }
-}
-
-fn answer(mut socket: Stamped, clock: u64, shared: &Shared) {
+fn answer(mut socket: Stamped, clock: u64, counts: &Counts, stop: &AtomicBool) {
     let mut buffer = [0; LENGTH];
     let mut second = HostTime::now();
     let mut in_second = 0;
-    while !shared.stop.load(Ordering::Relaxed) {
+    while !stop.load(Ordering::Relaxed) {
         let received = match socket.receive(&mut buffer) {
             Ok(Some(received)) => received,
             Ok(None) => continue,
@@ -96,12 +84,12 @@ fn answer(mut socket: Stamped, clock: u64, shared: &Shared) {
         in_second += 1;
         let question = buffer.get(..received.length).and_then(Question::from_bytes);
         let (Some(question), Some(from), true) = (question, received.from, in_second <= PER_SECOND) else {
-            shared.refused.fetch_add(1, Ordering::Relaxed);
+            counts.refused.fetch_add(1, Ordering::Relaxed);
             continue;
         };
         let answer = Answer { nonce: question.nonce, clock, t2: received.at.ns(), t3: HostTime::now().ns() };
         // An answer that cannot be sent is one that is lost.
         let _ = socket.socket().send_to(&answer.to_bytes(), from);
-        shared.answered.fetch_add(1, Ordering::Relaxed);
+        counts.answered.fetch_add(1, Ordering::Relaxed);
     }
 }

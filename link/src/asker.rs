@@ -1,8 +1,9 @@
 //! Asks another host for its clock, and keeps the offset.
 
-use crate::corridor::{Corridor, Exchange, Reading, Taken};
+use crate::corridor::{Corridor, Estimate, Exchange, Reading, Taken};
 use crate::stamped::Stamped;
 use crate::wire::{Answer, LENGTH, Question};
+use crate::worker::Worker;
 use core::time::Duration;
 use depthrig_bus::{HostTime, sync::lock};
 use serde::Serialize;
@@ -12,7 +13,6 @@ use std::io::{self, Read};
 use std::net::{SocketAddr, UdpSocket};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
-use std::thread::JoinHandle;
 
 /// From one question to the next.
 const EVERY: Duration = Duration::from_millis(50);
@@ -42,15 +42,16 @@ pub struct AskerState {
 /// A thread that asks until this is dropped.
 #[derive(Debug)]
 pub struct Asker {
-    shared: Arc<Shared>,
+    shared: Arc<Mutex<Shared>>,
     address: SocketAddr,
-    thread: Option<JoinHandle<()>>,
+    _thread: Worker,
 }
 
+/// Whoever reads it waits for no computation.
 #[derive(Debug, Default)]
 struct Shared {
-    stop: AtomicBool,
-    clock: Mutex<(Corridor, AskerState)>,
+    estimate: Option<Estimate>,
+    state: AskerState,
 }
 
 impl Asker {
@@ -60,18 +61,23 @@ impl Asker {
     /// When no thread can be started.
     pub fn start(address: SocketAddr) -> io::Result<Self> {
         let random = File::open("/dev/urandom")?;
-        let asking = Asking { address, socket: None, random, outstanding: VecDeque::new() };
-        let shared = Arc::new(Shared::default());
-        let of_thread = Arc::clone(&shared);
-        let thread = std::thread::Builder::new()
-            .name("link_clock".to_owned())
-            .spawn(move || asking.run(&of_thread))?;
-        Ok(Self { shared, address, thread: Some(thread) })
+        let shared = Arc::default();
+        let asking = Asking {
+            address,
+            socket: None,
+            random,
+            outstanding: VecDeque::new(),
+            corridor: Corridor::default(),
+            shared: Arc::clone(&shared),
+        };
+        let thread = Worker::start("link_clock", move |stop| asking.run(stop))?;
+        Ok(Self { shared, address, _thread: thread })
     }
 
     /// The remote clock at a local time; none before the first answer.
     pub fn at(&self, local: HostTime) -> Option<Reading> {
-        lock(&self.shared.clock).0.at(local)
+        let estimate = lock(&self.shared).estimate;
+        estimate.map(|estimate| estimate.at(local))
     }
 
     /// The host that is asked.
@@ -81,16 +87,7 @@ impl Asker {
 
     /// State of the exchange.
     pub fn state(&self) -> AskerState {
-        lock(&self.shared.clock).1
-    }
-}
-
-impl Drop for Asker {
-    fn drop(&mut self) {
-        self.shared.stop.store(true, Ordering::Relaxed);
-        if let Some(thread) = self.thread.take() {
-            let _ = thread.join();
-        }
+        lock(&self.shared).state
     }
 }
 
@@ -101,21 +98,23 @@ struct Asking {
     random: File,
     /// Questions without an answer, and when they were sent.
     outstanding: VecDeque<([u8; 16], HostTime)>,
+    corridor: Corridor,
+    shared: Arc<Mutex<Shared>>,
 }
 
 impl Asking {
-    fn run(mut self, shared: &Shared) {
+    fn run(mut self, stop: &AtomicBool) {
         let mut next = HostTime::now();
-        while !shared.stop.load(Ordering::Relaxed) {
+        while !stop.load(Ordering::Relaxed) {
             next = next.plus(EVERY).max(HostTime::now());
-            if let Err(e) = self.ask(shared) {
+            if let Err(e) = self.ask() {
                 tracing::debug!("the clock of {} is not asked: {e}", self.address);
             }
-            while self.wait(shared, next) {}
+            while self.wait(next) {}
         }
     }
 
-    fn ask(&mut self, shared: &Shared) -> io::Result<()> {
+    fn ask(&mut self) -> io::Result<()> {
         let socket = match self.socket.take() {
             Some(socket) => socket,
             None => connected(self.address)?,
@@ -127,14 +126,14 @@ impl Asking {
             self.outstanding.pop_front();
         }
         let question = Question { nonce }.to_bytes();
-        lock(&shared.clock).1.asked += 1;
+        lock(&self.shared).state.asked += 1;
         let sent = HostTime::now();
         self.outstanding.push_back((nonce, sent));
         socket.send(&question).map(drop)
     }
 
     /// Waits for a packet until it is time for the next question; `false` when it is.
-    fn wait(&mut self, shared: &Shared, next: HostTime) -> bool {
+    fn wait(&mut self, next: HostTime) -> bool {
         let left = next.from_now();
         if left.is_zero() {
             return false;
@@ -156,20 +155,23 @@ impl Asking {
         let answer = buffer.get(..received.length).and_then(Answer::from_bytes);
         let asked = answer.and_then(|a| self.outstanding.iter().position(|(nonce, _)| *nonce == a.nonce));
         let question = asked.and_then(|i| self.outstanding.remove(i));
-        let mut clock = lock(&shared.clock);
-        let (corridor, state) = &mut *clock;
+        let known = lock(&self.shared).state.clock;
         let taken = answer.zip(question).map(|(a, (_, t1))| {
-            if a.clock != state.clock {
+            if a.clock != known {
                 // Another computer, or this one after a start: what the clock said before is of no use.
-                corridor.restart();
-                state.clock = a.clock;
+                self.corridor.restart();
             }
             let exchange = Exchange { t1: t1.ns(), t2: a.t2, t3: a.t3, t4: received.at.ns() };
-            (exchange, corridor.take(exchange))
+            (a.clock, exchange, self.corridor.take(exchange))
         });
+        let estimate = self.corridor.estimate();
+        let mut shared = lock(&self.shared);
+        shared.estimate = estimate;
+        let state = &mut shared.state;
+        state.clock = taken.map_or(state.clock, |(clock, ..)| clock);
         match taken {
-            None | Some((_, Taken::Refused)) => state.refused += 1,
-            Some((exchange, taken)) => {
+            None | Some((.., Taken::Refused)) => state.refused += 1,
+            Some((_, exchange, taken)) => {
                 state.answered += 1;
                 state.bends += u64::from(taken == Taken::Bent);
                 state.round_trip_ns = exchange.round_trip_ns();

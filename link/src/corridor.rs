@@ -20,7 +20,7 @@ use std::collections::VecDeque;
 const WINDOW: Duration = Duration::from_secs(10);
 /// Largest rate of one clock against the other, minus one: two bad crystals, one of them slewed by NTP.
 const MAX_RATE: f64 = 1e-3;
-/// How fast two crystals may leave the line, per nanosecond after the last exchange.
+/// Rate at which two crystals may leave the line after the last exchange.
 const WANDER: f64 = 2e-6;
 /// Points that are closer together do not speak for a rate other than that of a good crystal, nanoseconds.
 const LEVER: f64 = 2e8;
@@ -92,6 +92,29 @@ pub struct Reading {
     pub epoch: u32,
 }
 
+impl Reading {
+    /// The reading `ns` later (earlier, if negative) on the local clock, without another exchange: its uncertainty has grown.
+    pub fn moved(self, ns: i64) -> Self {
+        let moved_ns = (ns as f64 * self.rate).round() as i64;
+        let grown_ns = (ns.unsigned_abs() as f64 * WANDER).ceil() as u64;
+        Self {
+            offset_ns: self.offset_ns.saturating_add(moved_ns),
+            uncertainty_ns: self.uncertainty_ns.saturating_add(grown_ns),
+            ..self
+        }
+    }
+}
+
+/// All that the exchanges so far say of the remote clock.
+#[derive(Debug, Clone, Copy)]
+pub struct Estimate {
+    lines: Lines,
+    /// Local time and offset that the lines are relative to.
+    origin: (i64, i64),
+    newest: i64,
+    epoch: u32,
+}
+
 /// The lines through the corridor; `x` is local time, `d` the offset, both relative to the epoch's first exchange.
 #[derive(Debug, Clone, Copy)]
 struct Lines {
@@ -136,13 +159,36 @@ impl Default for Corridor {
     }
 }
 
+impl Estimate {
+    /// The remote clock at a local time. Its uncertainty grows with the time since the last exchange.
+    pub fn at(&self, local: HostTime) -> Reading {
+        let lines = &self.lines;
+        let x = local.ns().saturating_sub(self.origin.0);
+        let middle = f64::midpoint(lines.low.at(x), lines.high.at(x));
+        // Between exchanges the extremes are at most this much further apart than the steepest and the flattest line say.
+        let before = (self.newest.saturating_sub(local.ns())).max(0) as f64;
+        let after = (local.ns().saturating_sub(self.newest)).max(0) as f64;
+        let top = lines.steepest.at(x).max(lines.high.at(x));
+        let bottom = lines.flattest.at(x).min(lines.low.at(x));
+        let range = (top - middle).max(middle - bottom);
+        let turn = before * (lines.steepest.slope - lines.flattest.slope);
+        Reading {
+            offset_ns: self.origin.1.saturating_add(middle.round() as i64),
+            uncertainty_ns: (range + turn + after * WANDER).ceil() as u64 + 1,
+            rate: lines.rate,
+            epoch: self.epoch,
+        }
+    }
+}
+
 impl Corridor {
     /// Takes an exchange that was sent after the one before.
     pub fn take(&mut self, e: Exchange) -> Taken {
         if !e.is_possible() || e.t1 <= self.asked {
             return Taken::Refused;
         }
-        let expected = self.at(HostTime::from_ns(e.t4));
+        let t4 = HostTime::from_ns(e.t4);
+        let expected = self.at(t4);
         if self.recent.len() == RECENT {
             self.recent.pop_front();
         }
@@ -163,7 +209,7 @@ impl Corridor {
         self.begin(&all, from);
         self.recent = all;
         self.recent.drain(..from);
-        let now = self.at(HostTime::from_ns(e.t4));
+        let now = self.at(t4);
         // A slewed clock is off by a round trip at most before it is noticed.
         let slack = self.recent.iter().map(|e| e.round_trip_ns().cast_unsigned()).min().unwrap_or(0);
         let went_on = expected.zip(now).is_some_and(|(old, new)| {
@@ -183,24 +229,15 @@ impl Corridor {
         self.recent.clear();
     }
 
-    /// The offset at a local time; none before the first exchange. Its uncertainty grows with the time since the last exchange.
+    /// The estimate; none before the first exchange.
+    pub fn estimate(&self) -> Option<Estimate> {
+        let Self { origin, newest, epoch, .. } = *self;
+        self.lines.map(|lines| Estimate { lines, origin, newest, epoch })
+    }
+
+    /// As [`Estimate::at`]; none before the first exchange.
     pub fn at(&self, local: HostTime) -> Option<Reading> {
-        let lines = self.lines.as_ref()?;
-        let x = local.ns().saturating_sub(self.origin.0);
-        let middle = f64::midpoint(lines.low.at(x), lines.high.at(x));
-        // Between exchanges the extremes are at most this much further apart than the steepest and the flattest line say.
-        let before = (self.newest.saturating_sub(local.ns())).max(0) as f64;
-        let after = (local.ns().saturating_sub(self.newest)).max(0) as f64;
-        let top = lines.steepest.at(x).max(lines.high.at(x));
-        let bottom = lines.flattest.at(x).min(lines.low.at(x));
-        let range = (top - middle).max(middle - bottom);
-        let turn = before * (lines.steepest.slope - lines.flattest.slope);
-        Some(Reading {
-            offset_ns: self.origin.1.saturating_add(middle.round() as i64),
-            uncertainty_ns: (range + turn + after * WANDER).ceil() as u64 + 1,
-            rate: lines.rate,
-            epoch: self.epoch,
-        })
+        self.estimate().map(|estimate| estimate.at(local))
     }
 
     /// Begins the corridor with these exchanges from `from` on; `false` when no line fits them.
@@ -242,11 +279,12 @@ impl Corridor {
             let (mut from, mut to) = (-MAX_RATE, MAX_RATE);
             for _ in 0..2 * STEPS {
                 let third = (to - from) / 3.0;
-                let (a, b) = (from + third, to - third);
-                if room(a)? - lever * a.abs() < room(b)? - lever * b.abs() {
-                    from = a;
+                let flatter = from + third;
+                let steeper = to - third;
+                if room(flatter)? - lever * flatter.abs() < room(steeper)? - lever * steeper.abs() {
+                    from = flatter;
                 } else {
-                    to = b;
+                    to = steeper;
                 }
             }
             Some(f64::midpoint(from, to))

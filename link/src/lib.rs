@@ -11,7 +11,8 @@ pub mod corridor;
 pub mod identity;
 mod stamped;
 mod wire;
+mod worker;
 
 pub use answerer::Answerer;
 pub use asker::Asker;
-pub use corridor::{Corridor, Exchange, Reading};
+pub use corridor::{Corridor, Estimate, Exchange, Reading};

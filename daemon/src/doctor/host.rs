@@ -26,7 +26,7 @@ pub struct Host {
     pub clock: Option<ClockSync>,
     /// Who runs a rig of this name now.
     pub rig_holder: Option<String>,
-    /// The clock of a session of several computers, or why it cannot be had; `None` for one computer.
+    /// The clock of a session of several computers, or why not; `None` for one computer.
     pub link: Option<Result<LinkStatus, String>>,
     /// The disk of the recordings.
     pub disk: DiskFacts,

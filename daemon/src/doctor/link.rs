@@ -7,7 +7,7 @@ use crate::status::{LinkState, LinkStatus};
 use core::time::Duration;
 use depthrig_bus::HostTime;
 
-/// How long the other computer has to answer; a second of answers gives a bound that sets need.
+/// Time for the other computer to answer; a second of answers gives a bound that sets need.
 const WAIT: Duration = Duration::from_millis(1500);
 /// Frames of two computers whose clocks are known worse than this are not of one moment, microseconds.
 const LOOSE_US: f64 = 1000.0;

@@ -617,7 +617,7 @@ fn the_clock_of_the_session_is_asked_for_before_a_session() {
     assert_eq!(ids, []);
     let (ids, text) = found(LinkRole::Recorder(recorder.address()));
     assert_eq!(ids, [("link_address", Severity::Error)]);
-    assert!(text.contains("cannot be listened on"), "{text}");
+    assert!(text.contains("is refused; listen in [link] must be an address of this computer"), "{text}");
     let address = recorder.address();
     drop(recorder);
     let (ids, text) = found(LinkRole::Camera(address));

@@ -8,22 +8,26 @@ use depthrig_bus::HostTime;
 use depthrig_link::Reading;
 use depthrig_recorder::{PixelMode, Session, SetReader};
 
-/// How fast two crystals may part beyond the last sample, per nanosecond.
-const WANDER: f64 = 2e-6;
+/// From the clock of a set to that of a replay.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Shift {
+    /// Added to its times, nanoseconds.
+    pub ns: i64,
+    /// The same at the first set of its epoch, nanoseconds: publishers of signals are known by a time.
+    pub epoch_ns: i64,
+    /// The shift may be wrong by this much, nanoseconds.
+    pub uncertainty_ns: u64,
+    /// A clock stepped beside the set, so that it may be wrong by more.
+    pub is_doubtful: bool,
+}
 
 /// A set's place on the session's clock.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Place {
     /// Log time of the set on the session's clock, nanoseconds.
     pub session_ns: i64,
-    /// The session's clock minus the computer's own, nanoseconds.
-    pub shift_ns: i64,
-    /// The same at the first set of its epoch, nanoseconds.
-    pub epoch_shift_ns: i64,
-    /// That may be wrong by this much, nanoseconds.
-    pub uncertainty_ns: u64,
-    /// A clock stepped beside the set, so that it may be wrong by more.
-    pub is_doubtful: bool,
+    /// From its computer's clock to the session's.
+    pub shift: Shift,
 }
 
 /// Which clock a dataset's session has, and the place of each set on it.
@@ -76,14 +80,14 @@ impl SessionClock {
         let mut places = Vec::new();
         for (tick, _) in &ticks {
             let (epoch, place) = place(*tick, &samples)?;
-            let epoch_shift_ns = match begun {
-                Some((before, shift_ns)) if before == epoch => shift_ns,
-                _ => place.shift_ns,
+            let epoch_ns = match begun {
+                Some((before, ns)) if before == epoch => ns,
+                _ => place.shift.ns,
             };
-            begun = Some((epoch, epoch_shift_ns));
-            places.push(Place { epoch_shift_ns, ..place });
+            begun = Some((epoch, epoch_ns));
+            places.push(Place { shift: Shift { epoch_ns, ..place.shift }, ..place });
         }
-        let utc_offset_ns = ticks.first()?.1.saturating_sub(places.first()?.shift_ns);
+        let utc_offset_ns = ticks.first()?.1.saturating_sub(places.first()?.shift.ns);
         Some(Self { clock, places, utc_offset_ns })
     }
 
@@ -98,22 +102,20 @@ impl SessionClock {
     }
 }
 
-/// The place of a set by the sample nearest in time, which is at most 0.1 s away while the recording has all of them.
-/// With its epoch.
+/// The place of a set by the sample nearest in time, which is at most 0.1 s away while the recording has all of them;
+/// with its epoch.
 fn place(tick: HostTime, samples: &[ClockSample]) -> Option<(u32, Place)> {
     let after = samples.partition_point(|s| s.time <= tick);
     let around = [after.checked_sub(1).and_then(|i| samples.get(i)), samples.get(after)];
     let nearest = around.iter().flatten().min_by_key(|s| tick.since_ns(s.time).saturating_abs())?;
-    let away = tick.since_ns(nearest.time) as f64;
-    let r = nearest.reading;
-    let shift_ns = r.offset_ns.saturating_add((away * r.rate).round() as i64);
-    let place = Place {
-        session_ns: tick.plus_ns(shift_ns).ns(),
-        shift_ns,
-        epoch_shift_ns: shift_ns,
-        uncertainty_ns: r.uncertainty_ns.saturating_add((away.abs() * WANDER).ceil() as u64),
+    let r = nearest.reading.moved(tick.since_ns(nearest.time));
+    let shift = Shift {
+        ns: r.offset_ns,
+        epoch_ns: r.offset_ns,
+        uncertainty_ns: r.uncertainty_ns,
         is_doubtful: matches!(around, [Some(a), Some(b)] if a.reading.epoch != b.reading.epoch),
     };
+    let place = Place { session_ns: tick.plus_ns(shift.ns).ns(), shift };
     Some((r.epoch, place))
 }
 
@@ -130,15 +132,15 @@ mod tests {
     fn a_set_goes_by_the_nearest_sample() {
         let samples = [sample(100, 5_000, 1), sample(200, 15_000, 1), sample(300, -7_000, 2)];
         let at = |ms: i64| place(HostTime::from_ns(ms * 1_000_000), &samples).unwrap().1;
-        assert_eq!((at(120).shift_ns, at(120).is_doubtful), (5_000 + 2_000, false));
+        assert_eq!((at(120).shift.ns, at(120).shift.is_doubtful), (5_000 + 2_000, false));
         assert_eq!(at(120).session_ns, 120_000_000 + 7_000);
-        assert_eq!(at(180).shift_ns, 15_000 - 2_000);
-        assert_eq!(at(120).uncertainty_ns, 1_000 + 40);
+        assert_eq!(at(180).shift.ns, 15_000 - 2_000);
+        assert_eq!(at(120).shift.uncertainty_ns, 1_000 + 40);
         // Between two epochs.
-        assert!(at(240).is_doubtful && at(260).is_doubtful);
+        assert!(at(240).shift.is_doubtful && at(260).shift.is_doubtful);
         // Before the first and after the last.
-        assert_eq!((at(0).shift_ns, at(0).is_doubtful), (5_000 - 10_000, false));
-        assert_eq!((at(400).shift_ns, at(400).is_doubtful), (-7_000 + 10_000, false));
+        assert_eq!((at(0).shift.ns, at(0).shift.is_doubtful), (5_000 - 10_000, false));
+        assert_eq!((at(400).shift.ns, at(400).shift.is_doubtful), (-7_000 + 10_000, false));
         assert_eq!(place(HostTime::from_ns(0), &[]), None);
     }
 }

@@ -1,6 +1,6 @@
 //! Where replayed sets come from: one or several datasets, read as the sets of one rig.
 
-use super::session_clock::{Place, SessionClock};
+use super::session_clock::{SessionClock, Shift};
 use super::signals::shifted;
 use super::timeline::{Part, Timeline};
 use crate::{Error, ErrorKind, Result};
@@ -89,8 +89,7 @@ impl Sources {
                 return Err(Error::new(ErrorKind::Other, message));
             }
             // One dataset is replayed on its own clock.
-            let mut clock =
-                if paths.len() > 1 { SessionClock::of(dataset.session(), &mut reader) } else { None };
+            let clock = if paths.len() > 1 { SessionClock::of(dataset.session(), &mut reader) } else { None };
             let first = sources.first().and_then(|s: &Source| s.clock.as_ref());
             if let (Some(own), Some(first)) = (&clock, first)
                 && own.clock != first.clock
@@ -101,8 +100,6 @@ impl Sources {
                     sources[0].dataset.path().display()
                 )));
             }
-            // Beside a dataset without the session's clock all go by UTC.
-            clock = clock.filter(|_| first.is_some() || sources.is_empty());
             let times = match &clock {
                 Some(clock) => clock.times(first.unwrap_or(clock).utc_offset_ns),
                 None => reader.times().to_vec(),
@@ -142,7 +139,14 @@ impl Sources {
         if sources.is_empty() {
             return Err(bad("name a dataset to replay"));
         }
-        if sources.iter().any(|s| s.clock.is_none()) {
+        // Beside a dataset without the session's clock all go by UTC.
+        if let Some(without) = sources.iter().position(|s| s.clock.is_none()) {
+            if sources.iter().any(|s| s.clock.is_some()) {
+                let path = sources[without].dataset.path().display();
+                tracing::warn!(
+                    "{path} has no clock of a session of several computers, so all datasets are joined by UTC"
+                );
+            }
             for source in &mut sources {
                 source.clock = None;
                 source.times = source.reader.times().to_vec();
@@ -251,10 +255,8 @@ impl Sources {
                     }
                     source.read = member.set as usize;
                     let place = source.clock.as_ref().and_then(|c| c.places.get(member.set as usize));
-                    let shift = place.map_or_else(
-                        || Shift::of_utc(set.utc_offset_ns, self.utc_offset_ns),
-                        |place| Shift::from(*place),
-                    );
+                    let by_utc = || Shift::of_utc(set.utc_offset_ns, self.utc_offset_ns);
+                    let shift = place.map_or_else(by_utc, |place| place.shift);
                     take(&mut read, set, source, shift, sets == 0);
                     sets += 1;
                 }
@@ -368,15 +370,6 @@ fn rig_of(sources: &[Source]) -> Result<RigName> {
     }
 }
 
-/// How the times of a set are moved onto the clock of the replay.
-#[derive(Debug, Clone, Copy, Default)]
-struct Shift {
-    ns: i64,
-    epoch_ns: i64,
-    uncertainty_ns: u64,
-    is_doubtful: bool,
-}
-
 impl Shift {
     /// From a clock with `offset_ns` to UTC onto the clock with `base_ns`.
     fn of_utc(offset_ns: i64, base_ns: i64) -> Self {
@@ -392,17 +385,6 @@ impl Shift {
         h.capture_uncertainty_ns = h.capture_uncertainty_ns.saturating_add(self.uncertainty_ns);
         if self.is_doubtful {
             h.flags |= FrameFlags::TIME_UNCERTAIN.0;
-        }
-    }
-}
-
-impl From<Place> for Shift {
-    fn from(p: Place) -> Self {
-        Self {
-            ns: p.shift_ns,
-            epoch_ns: p.epoch_shift_ns,
-            uncertainty_ns: p.uncertainty_ns,
-            is_doubtful: p.is_doubtful,
         }
     }
 }

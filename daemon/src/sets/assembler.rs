@@ -185,7 +185,7 @@ impl<T> Assembler<T> {
         }
     }
 
-    /// How far `next` is to be moved now to lie on the grid of the other clock.
+    /// The move of `next` now, towards the grid of the other clock.
     fn grid_shift(&mut self, next: i64) -> i64 {
         let period = self.config.period_ns;
         let beyond = next.saturating_add(self.offset).rem_euclid(period);
