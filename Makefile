@@ -26,7 +26,7 @@ REFERENCE := .venv-reference
 DOCS := .venv-docs
 REQUIREMENTS := python/requirements-test.txt tests/python/requirements-s3.txt $(READERS)/requirements.txt tests/page_browser/requirements.txt tests/terminal/requirements.txt
 
-.PHONY: help demo demo-calibration lab-demo train-tiny noise-models reference environments test check-debian13 test-long vm fuzz lint docs dist test-dist bench bench-page bench-peers bench-feed clean setup-build setup-test setup-vm setup-peers setup-fuzz setup-dist
+.PHONY: help demo demo-two-hosts demo-calibration lab-demo train-tiny noise-models reference environments test check-debian13 test-long vm fuzz lint docs dist test-dist bench bench-page bench-peers bench-feed clean setup-build setup-test setup-vm setup-peers setup-fuzz setup-dist
 
 help: ## show this list
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -34,6 +34,10 @@ help: ## show this list
 demo: setup-build ## the mount of seven cameras with ten depth modes, without a camera: record, verify, replay, report
 	@tools/onnxruntime.sh || true
 	tools/demo.sh $(ARGS)
+
+demo-two-hosts: ## the mount on two computers, as two namespaces: record, cut the wire, join, verify, replay
+	@tools/setup.sh build two-hosts
+	tools/demo-two-hosts.sh $(ARGS)
 
 demo-calibration: setup-build ## seven simulated cameras and a printed board: views, calibration, the cloud before and after
 	tools/demo-calibration.sh $(ARGS)
@@ -124,7 +128,7 @@ setup-build:
 	@tools/setup.sh build
 
 setup-test:
-	@tools/setup.sh build test
+	@tools/setup.sh build test two-hosts
 
 setup-vm:
 	@tools/setup.sh vm

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Installs the Debian packages for building (`build`), testing (`test`), testing on a real kernel (`vm`), comparing with
+# Installs the Debian packages for building (`build`), testing (`test`), two computers out of one (`two-hosts`), testing on a real kernel (`vm`), comparing with
 # other recorders (`peers`), fuzzing (`fuzz`) and building and testing packages (`dist`) if permitted; else prints the
 # command to run. Prints nothing if all are installed.
 set -euo pipefail
@@ -66,8 +66,15 @@ for part in "$@"; do
         need chromium command -v chromium
         # The boxes that tests run in.
         need util-linux command -v setpriv
-        # Two computers out of one; an ordinary user's PATH may lack /usr/sbin.
+        need procps command -v pgrep
+        ;;
+    two-hosts)
+        # An ordinary user's PATH may lack /usr/sbin.
         need iproute2 test -x /usr/sbin/tc
+        # One of them is reached with OpenSSH; its server, which is fetched below, needs this library.
+        need openssh-client command -v ssh
+        need libwrap0 sh -c 'ldconfig -p | grep -q libwrap.so.0 || /sbin/ldconfig -p | grep -q libwrap.so.0'
+        need util-linux command -v unshare
         need procps command -v pgrep
         ;;
     vm)
@@ -106,7 +113,7 @@ for part in "$@"; do
         need binutils command -v objdump
         ;;
     *)
-        echo "usage: tools/setup.sh [build] [test] [vm] [peers] [fuzz] [dist]" >&2
+        echo "usage: tools/setup.sh [build] [test] [two-hosts] [vm] [peers] [fuzz] [dist]" >&2
         exit 2
         ;;
     esac
@@ -138,14 +145,33 @@ if ! command -v cargo >/dev/null; then
     echo "Rust is missing: install the stable toolchain (1.92 or later) with rustup, see https://rustup.rs" >&2
     exit 1
 fi
-[ ${#missing[@]} -eq 0 ] && exit 0
-
-install=(install --yes --no-install-recommends "${missing[@]}")
-if [ ${#apt[@]} -eq 0 ]; then
-    echo "missing: ${missing[*]}. Install them, then run this again:" >&2
-    echo "  sudo apt-get ${install[*]}" >&2
-    exit 1
+if [ ${#missing[@]} -gt 0 ]; then
+    install=(install --yes --no-install-recommends "${missing[@]}")
+    if [ ${#apt[@]} -eq 0 ]; then
+        echo "missing: ${missing[*]}. Install them, then run this again:" >&2
+        echo "  sudo apt-get ${install[*]}" >&2
+        exit 1
+    fi
+    echo "installing: ${missing[*]}"
+    "${apt[@]}" update --quiet=2
+    "${apt[@]}" "${install[@]}"
 fi
-echo "installing: ${missing[*]}"
-"${apt[@]}" update --quiet=2
-"${apt[@]}" "${install[@]}"
+
+# An OpenSSH server for tests of two computers. The package is not installed: it would serve on port 22 of this computer.
+server=${CARGO_TARGET_DIR:-target}/sshd
+fetch_sshd() {
+    local work
+    work=$(mktemp --directory) || return
+    (cd "$work" && apt-get download --quiet=2 openssh-server >/dev/null 2>&1) &&
+        mkdir -p "$server" && dpkg-deb --extract "$work"/openssh-server_*.deb "$server"
+    local status=$?
+    rm -rf "$work"
+    return "$status"
+}
+case " $* " in
+*" two-hosts "*)
+    if [ ! -x /usr/sbin/sshd ] && [ ! -x "$server/usr/sbin/sshd" ] && command -v apt-get >/dev/null; then
+        fetch_sshd || echo "no OpenSSH server was fetched: what needs two computers is skipped" >&2
+    fi
+    ;;
+esac

@@ -4,7 +4,7 @@
 //! iceoryx2 lives below it or is named after it, so that no other user's process can stall a camera and
 //! depthrig never disturbs other iceoryx2 applications on the machine.
 
-use crate::{Error, ErrorKind, Result, RigName, umask};
+use crate::{Error, ErrorKind, Name, Result, RigName, umask};
 use core::time::Duration;
 use rustix::fs::{FileType, FlockOperation, Mode, OFlags, flock};
 use std::io::{Read, Seek, Write};
@@ -94,6 +94,12 @@ impl RuntimeDir {
     /// The control socket of `rig`.
     pub fn socket_path(&self, rig: &RigName) -> PathBuf {
         self.0.join(format!("{rig}.sock"))
+    }
+
+    /// The socket on this computer that reaches the control socket of `rig` on another one.
+    pub fn host_socket_path(&self, rig: &RigName, host: &Name) -> PathBuf {
+        // Names have no `@`.
+        self.0.join(format!("{rig}@{host}.sock"))
     }
 
     /// Rigs that run now: those whose lock is held.

@@ -47,6 +47,7 @@ export function readiness(status, doctor) {
   const good = [];
   streams(status, { bad, odd, good });
   signals(status, { bad });
+  computers(status, { bad, good });
   room(status, doctor, { bad, odd, good });
   spread(status, { odd, good });
   if (doctor !== null) {
@@ -94,6 +95,33 @@ function signals(status, { bad }) {
   const faults = (status.signals ?? []).filter(({ required, state }) => required && state !== "live");
   if (faults.length > 0) {
     bad.push(`${some(faults.map(({ signal, state }) => `${signal} (${state})`))}: no samples (I)`);
+  }
+}
+
+/**
+ * The clock of the session, and the other computers of the rig.
+ *
+ * @param {Status} status
+ * @param {{bad: string[], good: string[]}} lists
+ */
+function computers(status, { bad, good }) {
+  const { link } = status;
+  if (link && (link.state === "silent" || link.state === "unknown")) {
+    bad.push(`the clock of ${link.recorder ?? "the session"} does not answer`);
+  }
+  const hosts = status.hosts?.hosts ?? [];
+  for (const { host, state, why, cameras, streaming, has_clock } of hosts) {
+    if (state !== "connected") {
+      bad.push(`${host} (${state}): ${why ?? ""}`);
+    } else if (streaming < cameras) {
+      bad.push(`${host}: ${streaming} of ${counted(cameras, "camera")}`);
+    } else if (!has_clock) {
+      bad.push(`${host}: its clock is not known yet`);
+    }
+  }
+  const connected = hosts.filter(({ state }) => state === "connected");
+  if (connected.length > 0) {
+    good.push(`with ${some(connected.map(({ host }) => host))}`);
   }
 }
 

@@ -125,6 +125,22 @@
  * @property {number} [spread_p95_ms]
  * @property {{stream: string, median_ms: number, p95_ms: number}[]} [skews] from the tick of the set
  *
+ * @typedef {Object} LinkStatus the clock of the session, in a rig of several computers
+ * @property {string} host
+ * @property {string | null} recorder
+ * @property {"own" | "live" | "silent" | "unknown"} state
+ *
+ * @typedef {Object} HostStatus another computer of the rig
+ * @property {string} host
+ * @property {"connected" | "absent" | "refused"} state
+ * @property {string | null} why
+ * @property {number} cameras
+ * @property {number} streaming
+ * @property {boolean} has_clock
+ *
+ * @typedef {Object} HostsStatus
+ * @property {HostStatus[]} hosts
+ *
  * @typedef {Object} Status
  * @property {string} rig
  * @property {string} version
@@ -132,6 +148,8 @@
  * @property {{share: number, error: string | null} | null} preparing
  * @property {CameraStatus[]} cameras
  * @property {SignalStatus[]} [signals]
+ * @property {LinkStatus | null} [link]
+ * @property {HostsStatus | null} [hosts]
  * @property {SetStatus} sets
  * @property {RecordingStatus | null} recording
  * @property {number} cpu_cores

@@ -16,6 +16,7 @@
 
 mod allowed;
 mod events;
+mod files;
 mod foxglove;
 mod guard;
 mod limits;
@@ -30,6 +31,10 @@ mod socket;
 mod token;
 
 pub use events::{CaptureEvent, MAX_FOLLOWERS};
+pub use files::{
+    BytesRequest, FileDigest, FileRequest, MAX_PART_BYTES, RecordingFile, RecordingFiles, digest_of,
+    is_served,
+};
 pub use page::PageAddress;
 pub use recordings::{MarkRequest, NameRequest, Recording, Recordings, ReportPage};
 pub(crate) use reply::{ErrorBody, kind_of_name};

@@ -6,12 +6,15 @@ mod http;
 #[cfg(test)]
 mod tests;
 
-use crate::api::{self, LoopRequest, NoteRequest, PageAddress, RateRequest, StepRequest};
+use crate::api::{
+    self, BytesRequest, FileDigest, FileRequest, LoopRequest, NoteRequest, PageAddress, RateRequest,
+    RecordingFiles, StepRequest,
+};
 use crate::control::{EpisodeRequest, RecordRequest, SeekRequest};
 use crate::status::{RecordingStatus, ReplayStatus, RigStatus};
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
-use depthrig_bus::{RigName, RuntimeDir};
+use depthrig_bus::{Name, RigName, RuntimeDir};
 use depthrig_recorder::Episode;
 use http::{Answer, Connector, Failure};
 use serde::Serialize;
@@ -22,11 +25,16 @@ const TIMEOUT: Duration = Duration::from_secs(10);
 /// How long closing a recording may take: the disk decides.
 const STOP_TIMEOUT: Duration = Duration::from_mins(10);
 
+/// How long a call to another computer may take.
+const HOST_TIMEOUT: Duration = Duration::from_secs(2);
+
 /// A client of one rig's daemon. Not for use inside an async runtime: its calls block.
 #[derive(Debug)]
 pub struct Client {
     rig: RigName,
     runtime: RuntimeDir,
+    /// The other computer whose daemon it is.
+    host: Option<Name>,
     connector: Connector,
 }
 
@@ -63,10 +71,25 @@ impl Client {
             }
         };
         let connector = Connector::new(runtime.socket_path(&rig))?;
-        let client = Self { rig, runtime: runtime.clone(), connector };
+        let client = Self { rig, runtime: runtime.clone(), host: None, connector };
         // A daemon that does not answer is better said now than in the middle of something.
-        client.send("GET", "/v1/config", None, TIMEOUT)?;
+        client.send("GET", "/v1/config", None, client.timeout())?;
         Ok(client)
+    }
+
+    /// A client of the daemon of `rig` on another computer, through a socket that the daemon of this one keeps
+    /// ([`crate::hosts`]), whether anything answers there now or not.
+    ///
+    /// # Errors
+    /// `Other` when no client can be made.
+    pub fn of_host(runtime: &RuntimeDir, rig: &RigName, host: &Name) -> Result<Self> {
+        let connector = Connector::new(runtime.host_socket_path(rig, host))?;
+        Ok(Self { rig: rig.clone(), runtime: runtime.clone(), host: Some(host.clone()), connector })
+    }
+
+    /// How long a call that is answered at once may take.
+    const fn timeout(&self) -> Duration {
+        if self.host.is_some() { HOST_TIMEOUT } else { TIMEOUT }
     }
 
     /// The rig that this client speaks to.
@@ -87,7 +110,7 @@ impl Client {
     /// # Errors
     /// As [`Self::status`].
     pub fn config(&self) -> Result<String> {
-        let answer = self.send("GET", "/v1/config", None, TIMEOUT)?;
+        let answer = self.send("GET", "/v1/config", None, self.timeout())?;
         String::from_utf8(answer.body).map_err(|e| self.garbled("/v1/config", &e).with_source(e))
     }
 
@@ -129,7 +152,7 @@ impl Client {
     /// As [`Self::status`] and [`crate::control::Control::record_note`].
     pub fn record_note(&self, text: &str) -> Result<()> {
         let body = self.encode(&NoteRequest { text: text.to_owned() })?;
-        self.send("POST", "/v1/record/note", Some(body), TIMEOUT).map(drop)
+        self.send("POST", "/v1/record/note", Some(body), self.timeout()).map(drop)
     }
 
     /// Begins, ends or judges an episode.
@@ -137,7 +160,7 @@ impl Client {
     /// # Errors
     /// As [`Self::status`] and [`crate::control::Control::episode`].
     pub fn episode(&self, request: &EpisodeRequest) -> Result<Episode> {
-        self.post("/v1/episode", request, TIMEOUT)
+        self.post("/v1/episode", request, self.timeout())
     }
 
     /// How far the replay has come.
@@ -153,7 +176,7 @@ impl Client {
     /// # Errors
     /// As [`Self::replay`] and [`crate::control::ReplayControl::pause`].
     pub fn replay_pause(&self) -> Result<ReplayStatus> {
-        self.post("/v1/replay/pause", &serde_json::Map::new(), TIMEOUT)
+        self.post("/v1/replay/pause", &serde_json::Map::new(), self.timeout())
     }
 
     /// Plays on.
@@ -161,7 +184,7 @@ impl Client {
     /// # Errors
     /// As [`Self::replay`] and [`crate::control::ReplayControl::resume`].
     pub fn replay_resume(&self) -> Result<ReplayStatus> {
-        self.post("/v1/replay/resume", &serde_json::Map::new(), TIMEOUT)
+        self.post("/v1/replay/resume", &serde_json::Map::new(), self.timeout())
     }
 
     /// Goes to a set and publishes it.
@@ -169,7 +192,7 @@ impl Client {
     /// # Errors
     /// As [`Self::replay`] and [`crate::control::ReplayControl::seek`].
     pub fn replay_seek(&self, to: &SeekRequest) -> Result<ReplayStatus> {
-        self.post("/v1/replay/seek", to, TIMEOUT)
+        self.post("/v1/replay/seek", to, self.timeout())
     }
 
     /// Plays so many sets and pauses; a negative number goes back.
@@ -177,7 +200,7 @@ impl Client {
     /// # Errors
     /// As [`Self::replay`] and [`crate::control::ReplayControl::step`].
     pub fn replay_step(&self, sets: i64) -> Result<ReplayStatus> {
-        self.post("/v1/replay/step", &StepRequest { sets }, TIMEOUT)
+        self.post("/v1/replay/step", &StepRequest { sets }, self.timeout())
     }
 
     /// Changes the speed of the replay.
@@ -185,7 +208,7 @@ impl Client {
     /// # Errors
     /// As [`Self::replay`] and [`crate::control::ReplayControl::set_rate`].
     pub fn replay_rate(&self, rate: f64) -> Result<ReplayStatus> {
-        self.post("/v1/replay/rate", &RateRequest { rate }, TIMEOUT)
+        self.post("/v1/replay/rate", &RateRequest { rate }, self.timeout())
     }
 
     /// Whether the replay begins again at its end.
@@ -193,7 +216,7 @@ impl Client {
     /// # Errors
     /// As [`Self::replay`] and [`crate::control::ReplayControl::set_loop`].
     pub fn replay_loop(&self, on: bool) -> Result<ReplayStatus> {
-        self.post("/v1/replay/loop", &LoopRequest { on }, TIMEOUT)
+        self.post("/v1/replay/loop", &LoopRequest { on }, self.timeout())
     }
 
     /// Passes an event of a calibration on to those who follow.
@@ -201,7 +224,32 @@ impl Client {
     /// # Errors
     /// As [`Self::status`], and `NotFound` of a daemon that knows no such events.
     pub fn calibration_event(&self, event: &api::CaptureEvent) -> Result<()> {
-        self.send("POST", "/v1/calibration/events", Some(self.encode(event)?), TIMEOUT).map(drop)
+        self.send("POST", "/v1/calibration/events", Some(self.encode(event)?), self.timeout()).map(drop)
+    }
+
+    /// The files of a recording.
+    ///
+    /// # Errors
+    /// As [`Self::status`], `NotFound`.
+    pub fn recording_files(&self, name: &str) -> Result<RecordingFiles> {
+        self.post("/v1/recordings/files", &api::NameRequest { name: name.to_owned() }, self.timeout())
+    }
+
+    /// Bytes of a file of a recording; fewer than asked for at its end.
+    ///
+    /// # Errors
+    /// As [`Self::recording_files`].
+    pub fn recording_bytes(&self, part: &BytesRequest) -> Result<Vec<u8>> {
+        let body = self.encode(part)?;
+        Ok(self.send("POST", "/v1/recordings/bytes", Some(body), self.timeout())?.body)
+    }
+
+    /// Length and checksum of a file of a recording.
+    ///
+    /// # Errors
+    /// As [`Self::recording_files`].
+    pub fn recording_digest(&self, file: &FileRequest) -> Result<FileDigest> {
+        self.post("/v1/recordings/digest", file, STOP_TIMEOUT)
     }
 
     /// Asks the daemon to end; it closes a recording before it does.
@@ -209,11 +257,11 @@ impl Client {
     /// # Errors
     /// As [`Self::status`].
     pub fn stop(&self) -> Result<()> {
-        self.send("POST", "/v1/stop", Some(b"{}".to_vec()), TIMEOUT).map(drop)
+        self.send("POST", "/v1/stop", Some(b"{}".to_vec()), self.timeout()).map(drop)
     }
 
     fn get<T: DeserializeOwned>(&self, path: &str) -> Result<T> {
-        let answer = self.send("GET", path, None, TIMEOUT)?;
+        let answer = self.send("GET", path, None, self.timeout())?;
         serde_json::from_slice(&answer.body).map_err(|e| self.garbled(path, &e).with_source(e))
     }
 
@@ -265,6 +313,17 @@ impl Client {
 
     fn unreachable(&self, failure: Failure) -> Error {
         let rig = &self.rig;
+        if let Some(host) = &self.host {
+            let what = match &failure {
+                Failure::Absent(_) | Failure::Refused(_) => {
+                    format!("host {host} of rig \"{rig}\" is not connected; depthrig status says why")
+                }
+                _ => format!(
+                    "host {host} of rig \"{rig}\" does not answer: {failure}; depthrig runs there and is this rig?"
+                ),
+            };
+            return Error::new(ErrorKind::Unreachable, what).with_source(failure);
+        }
         let socket = self.connector.path().display();
         let holder = self.runtime.holder(rig);
         let (kind, what) = match (&failure, holder) {

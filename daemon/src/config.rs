@@ -84,6 +84,31 @@ pub struct LinkConfig {
     pub host: Name,
     /// Its role there.
     pub role: LinkRole,
+    /// The other computers, which record when this one does.
+    pub hosts: Vec<HostConfig>,
+}
+
+/// Another computer of the rig, as the one that records reaches it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct HostConfig {
+    /// Its name in the rig.
+    pub name: Name,
+    /// How its daemon's control socket is reached.
+    pub reach: Reach,
+}
+
+/// How the control socket of another daemon is reached.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Reach {
+    /// With OpenSSH.
+    Ssh {
+        /// `user@address`, or a `Host` of the user's `~/.ssh/config`.
+        destination: String,
+        /// Its path there; `None`: in the folder of that user's rigs.
+        socket: Option<PathBuf>,
+    },
+    /// A socket on this computer that something else connects with it.
+    Socket(PathBuf),
 }
 
 /// Whose clock is that of the session.

@@ -9,8 +9,8 @@ mod family;
 mod tests;
 
 use crate::status::{
-    CameraState, ClockStatus, RecordingStatus, RefineState, RefineStatus, RigStatus, SetAccount, SetStatus,
-    StreamStatus,
+    CameraState, ClockStatus, HostState, HostStatus, LinkState, RecordingStatus, RefineState, RefineStatus,
+    RigStatus, SetAccount, SetStatus, StreamStatus,
 };
 use depthrig_bus::DropReason;
 use family::{Families, Labels, Unit};
@@ -36,11 +36,43 @@ pub fn render(status: &RigStatus) -> String {
             set_frames(&mut f, &labels, &stream.in_sets);
         }
     }
+    for host in status.hosts.iter().flat_map(|h| &h.hosts) {
+        hosts(&mut f, host);
+    }
+    for part in status.hosts.iter().filter_map(|h| h.session.as_ref()).flat_map(|s| &s.parts) {
+        let labels = Labels::new(&[("host", &part.host), ("part", &part.name)]);
+        let there = "Bytes of the part of the newest recording that the host made.";
+        f.gauge("part_size", there, Unit::Bytes, &labels, part.bytes as f64);
+        f.gauge("part_pulled", "Bytes of it that are here.", Unit::Bytes, &labels, part.pulled_bytes as f64);
+    }
+    if let Some(link) = &status.link {
+        let labels = Labels::new(&[("host", &link.host)]);
+        let is_known = matches!(link.state, LinkState::Own | LinkState::Live);
+        f.gauge("link_up", "1 while the clock of the session is known.", Unit::None, &labels, flag(is_known));
+        if let Some(us) = link.uncertainty_us {
+            let help = "Bound of the error of the session's clock.";
+            f.gauge("link_uncertainty", help, Unit::Seconds, &labels, us / 1e6);
+        }
+    }
     sets(&mut f, &status.sets);
     if let Some(recording) = &status.recording {
         record(&mut f, recording);
     }
     f.into_text()
+}
+
+fn hosts(f: &mut Families, host: &HostStatus) {
+    let labels = Labels::new(&[("host", &host.host)]);
+    let is_up = host.state == HostState::Connected;
+    f.gauge(
+        "host_up",
+        "1 while the daemon of the host answers as part of the rig.",
+        Unit::None,
+        &labels,
+        flag(is_up),
+    );
+    let cameras = "Cameras of the host that stream.";
+    f.gauge("host_cameras", cameras, Unit::None, &labels, host.streaming as f64);
 }
 
 fn daemon(f: &mut Families, s: &RigStatus) {

@@ -16,6 +16,7 @@ use place::place;
 pub use recovery::recover_left;
 use spread::{max_spread_ns, reach_ns};
 use std::collections::HashMap;
+use std::path::PathBuf;
 use std::sync::Arc;
 
 pub mod budget;
@@ -391,6 +392,11 @@ impl Recording {
     /// Whether a recording is going on.
     pub const fn is_active(&self) -> bool {
         self.active.is_some()
+    }
+
+    /// The folder that is being recorded into.
+    pub fn active_path(&self) -> Option<PathBuf> {
+        self.active.as_ref().map(|active| PathBuf::from(&active.status.path))
     }
 
     /// Whether a recording is going on that has lasted as long as it was to.

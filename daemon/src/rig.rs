@@ -25,6 +25,7 @@ use crate::camera::{Camera, Shared};
 use crate::config::RigConfig;
 use crate::control::{Control, Shows};
 use crate::family::Preparation;
+use crate::hosts::{Hosts, JoinParts};
 use crate::link::Link;
 use crate::recording::{Outside, Recording, Reports, recover_left};
 use crate::sets::SpreadStats;
@@ -82,6 +83,8 @@ pub struct RigOptions {
     pub refiners: Option<Arc<dyn Refiners>>,
     /// Shows datasets on the live page; without it the page has the cameras alone.
     pub shows: Option<Arc<dyn Shows>>,
+    /// Joins the parts of recordings of several computers; without it they stay parts.
+    pub join: Option<JoinParts>,
     /// Simulated cameras stream before their scenes are rendered, with coarse images until then.
     pub draw_while_running: bool,
 }
@@ -99,6 +102,7 @@ impl RigOptions {
             backlog_max_bytes: None,
             refiners: None,
             shows: None,
+            join: None,
             draw_while_running: false,
         }
     }
@@ -154,6 +158,8 @@ pub struct Inner {
     held_sets: AtomicUsize,
     /// The clock of the session, in a rig of several computers.
     link: Option<Arc<Link>>,
+    /// The other computers, on the one that records.
+    hosts: Option<Arc<Hosts>>,
 }
 
 /// The set assembler's numbers, as `status` shows them.
@@ -199,6 +205,7 @@ impl Rig {
             bus,
         });
         let link = config.link.as_ref().map(Link::start).transpose()?.map(Arc::new);
+        let hosts = Hosts::new(&config, &options.runtime, options.join)?.map(Arc::new);
         let late_after_ns = live_late_ns((1e9 / config.sets.rate_hz) as i64);
         let inner = Arc::new(Inner {
             cameras: config.cameras.iter().map(|c| Arc::new(Camera::new(c.clone()))).collect(),
@@ -226,6 +233,7 @@ impl Rig {
             runtime: options.runtime.clone(),
             held_sets: AtomicUsize::new(0),
             link,
+            hosts,
         });
         let assembly = Assembly::new(Arc::clone(&inner))?;
         let signals = signals::Collector::new(Arc::clone(&inner))?;
@@ -251,6 +259,7 @@ impl Rig {
             let publisher = link.publisher(&options.runtime)?;
             rig.spawn("link", move |stop| publisher.run(&link, stop))?;
         }
+        rig.keep_hosts()?;
         let inner = Arc::clone(&rig.inner);
         rig.spawn("housekeeping", move |stop| housekeeping(&inner, stop))?;
         if rig.inner.config.recording.recover_on_start {
@@ -354,6 +363,22 @@ impl Rig {
     fn spawn(&mut self, name: &str, run: impl FnOnce(&AtomicBool) + Send + 'static) -> Result<()> {
         self.threads.push(start_thread(name, run)?);
         Ok(())
+    }
+
+    /// A thread for each other computer, and one that joins what they recorded.
+    fn keep_hosts(&mut self) -> Result<()> {
+        let Some(hosts) = self.inner.hosts.clone() else { return Ok(()) };
+        for number in 0..hosts.count() {
+            let inner = Arc::clone(&self.inner);
+            let hosts = Arc::clone(&hosts);
+            self.spawn("host", move |stop| {
+                let kept = hosts.keep(number, &|| inner.recording().active_path(), stop);
+                if let Err(e) = kept {
+                    tracing::error!("{e}");
+                }
+            })?;
+        }
+        self.spawn("join", move |stop| hosts.join_complete(stop))
     }
 
     /// Reports too little shared memory once, for all cameras together.

@@ -1,5 +1,9 @@
 //! Status of the daemon: the one structure behind `status`, `top`, `/v1/status` and `/metrics`.
 
+mod hosts;
+
+pub use hosts::{HostState, HostStatus, HostsStatus, JoinState, PartStatus, SessionStatus};
+
 use depthrig_recorder::Episode;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -27,6 +31,9 @@ pub struct RigStatus {
     /// The clock of the session, in a rig of several computers.
     #[serde(default)]
     pub link: Option<LinkStatus>,
+    /// The other computers, on the one that records.
+    #[serde(default)]
+    pub hosts: Option<HostsStatus>,
     /// The set assembler.
     pub sets: SetStatus,
     /// The recording in progress, or the last one.

@@ -148,6 +148,18 @@ const EPISODES: [(&str, u16); 5] = [
     ("{}", 400),
 ];
 
+/// Calls that a rig without cameras and recordings refuses.
+const WITHOUT_CAMERAS: [(&str, &str); 8] = [
+    ("/v1/recordings/mark", r#"{"name": "x", "mark": "bad"}"#),
+    ("/v1/recordings/report", r#"{"name": "x"}"#),
+    ("/v1/recordings/files", r#"{"name": "x"}"#),
+    ("/v1/recordings/bytes", r#"{"name": "x", "file": "session.toml", "offset": 0, "length": 1}"#),
+    ("/v1/recordings/digest", r#"{"name": "x", "file": "session.toml"}"#),
+    ("/v1/controls", r#"{"camera": "x", "name": "gain", "value": 1}"#),
+    ("/v1/controls/revert", r#"{"camera": "x"}"#),
+    ("/v1/controls/save", r#"{"fingerprint": "x"}"#),
+];
+
 #[test]
 fn every_answer_of_a_live_server_fits_the_document() {
     let served = served();
@@ -190,13 +202,7 @@ fn every_answer_of_a_live_server_fits_the_document() {
     check("GET", "/v1/recordings/image", &served.get("/v1/recordings/image?name=x"), 409);
     check("GET", "/v1/recordings/image", &served.get("/v1/recordings/image"), 400);
     check("GET", "/v1/report/{ticket}", &served.get("/v1/report/0123"), 404);
-    for (path, body) in [
-        ("/v1/recordings/mark", r#"{"name": "x", "mark": "bad"}"#),
-        ("/v1/recordings/report", r#"{"name": "x"}"#),
-        ("/v1/controls", r#"{"camera": "x", "name": "gain", "value": 1}"#),
-        ("/v1/controls/revert", r#"{"camera": "x"}"#),
-        ("/v1/controls/save", r#"{"fingerprint": "x"}"#),
-    ] {
+    for (path, body) in WITHOUT_CAMERAS {
         check("POST", path, &served.post(path, body), 409);
         check("POST", path, &served.post(path, r#"{"unknown": 1}"#), 400);
     }

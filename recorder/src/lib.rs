@@ -83,7 +83,7 @@ pub use select::{Edge, Moment, SetSpan};
 pub use session::{
     Computed, Derived, Edit, Episode, EpisodeCounts, EpisodeEnd, EpisodeOutcome, FORMAT, Mark, MotionRecord,
     NOTE_MAX_BYTES, Note, Outcome, SESSION_FILE, Session, SessionChanges, SignalRecord, StreamCalibration,
-    StreamRecord, UnitCalibration, check_name, edit, rename,
+    StreamRecord, UnitCalibration, adopt, check_name, edit, rename,
 };
 pub use slice::{SliceOptions, SliceProgress, SliceReport, merge, trim};
 pub use still::{StillFormat, still};

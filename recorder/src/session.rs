@@ -15,7 +15,7 @@ mod limits;
 mod signal;
 
 pub(crate) use edit::SessionText;
-pub use edit::{SessionChanges, StreamCalibration, UnitCalibration, check_name, edit, rename};
+pub use edit::{SessionChanges, StreamCalibration, UnitCalibration, adopt, check_name, edit, rename};
 pub use episode::{Episode, EpisodeCounts, EpisodeEnd, EpisodeOutcome};
 pub use signal::SignalRecord;
 

@@ -99,6 +99,13 @@ test("a stream that does not come is a no-go, and is named", () => {
   assert.match(readiness(rig(failed), null).text, /c \(failed\)/);
   const imu = [camera("a", [stream("a/color"), stream("a/imu", { samples_hz: 200, last_frame_age_ms: null })])];
   assert.equal(readiness(rig(imu), null).state, "go");
+  const left = { host: "left", state: "connected", why: null, cameras: 3, streaming: 3, has_clock: true };
+  const withLeft = (/** @type {object} */ more) => readiness({ ...rig(both), hosts: { hosts: [{ ...left, ...more }] } }, null).text;
+  assert.match(withLeft({}), /^Go: .*with left/);
+  assert.match(withLeft({ state: "absent", why: "ssh left: no route" }), /^No-go: left \(absent\): ssh left: no route/);
+  assert.match(withLeft({ streaming: 2 }), /^No-go: left: 2 of 3 cameras/);
+  assert.match(withLeft({ has_clock: false }), /^No-go: left: its clock is not known yet/);
+  assert.match(readiness({ ...rig(both), link: { host: "a", recorder: "b", state: "silent" } }, null).text, /the clock of b does not answer/);
 });
 
 test("few minutes, a wide spread and doctor's findings are said", () => {

@@ -219,6 +219,12 @@ class Wall:
         """All that the record bar says, for the message of a test that waited in vain."""
         return f"{self.state('#connection')}: {self.page.inner_text('#record')}"
 
+    def press_record(self, state: str) -> None:
+        """Space, as soon as the page takes it, as its button shows: not before the first status. Until the recording is in `state`."""
+        until(lambda: self.page.is_enabled("#start-stop"), self.record_text)
+        self.page.keyboard.press("Space")
+        until(lambda: self.state("#record-state") == state, self.record_text)
+
     def tile(self, stream: str) -> Locator:
         return self.page.locator(f'section.tile[data-stream="{stream}"]')
 

@@ -167,12 +167,10 @@ def test_a_page_that_missed_a_start_says_so_and_stops_nothing(browser: Browser, 
     with opened(browser, rig) as first, blank(browser, rig.origin) as second:
         second.page.route_web_socket(SOCKET, through(late))
         second.open(rig.text)
-        second.wait_for_state("#record-state", "idle")
         second.wait_for_image("still/color")
-        first.wait_for_state("#record-state", "idle")
+        until(lambda: second.page.is_enabled("#start-stop"), second.record_text)
         is_late["now"] = True
-        first.page.keyboard.press("Space")
-        until(lambda: first.state("#record-state") == "recording", first.record_text)
+        first.press_record("recording")
         assert second.state("#record-state") == "idle"
         second.page.keyboard.press("Space")
         error = second.page.locator("#record-error")

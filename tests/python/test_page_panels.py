@@ -121,15 +121,13 @@ def wait_for_text(place: Locator, text: str) -> None:
 
 
 def start(wall: Wall) -> None:
-    press(wall, "Space")
-    wall.wait_for_state("#record-state", "recording")
+    wall.press_record("recording")
     # Its first set.
     until(lambda: re.search(r"[1-9]\d* sets", wall.page.inner_text("#record-progress")))
 
 
 def stop(wall: Wall) -> None:
-    press(wall, "Space")
-    wall.wait_for_state("#record-state", "idle")
+    wall.press_record("idle")
 
 
 # The colour in the middle of a patch of the small image.
@@ -436,6 +434,7 @@ def test_a_countdown_can_be_cancelled(wall: Wall, folder: Path) -> None:
     count = len(datasets(folder))
     wall.page.select_option("#countdown", "3")
     wall.page.evaluate("document.activeElement.blur()")
+    until(lambda: wall.page.is_enabled("#start-stop"), wall.record_text)
     for cancel in ("Escape", "Space"):
         press(wall, "Space")
         wait_for_text(wall.page.locator("#start-stop"), "Cancel (")

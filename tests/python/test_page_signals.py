@@ -193,13 +193,11 @@ def test_two_pages_show_a_signal_over_one_channel_end(browser: Browser, rig: Add
 def start_recording(wall: Wall) -> None:
     # The required signal comes.
     until(lambda: not wall.page.inner_text("#ready").startswith("No-go"), lambda: wall.page.inner_text("#ready"))
-    wall.page.keyboard.press("Space")
-    until(lambda: wall.state("#record-state") == "recording", wall.record_text)
+    wall.press_record("recording")
 
 
 def stop_recording(wall: Wall) -> None:
-    wall.page.keyboard.press("Space")
-    until(lambda: wall.state("#record-state") == "idle", wall.record_text)
+    wall.press_record("idle")
 
 
 def episodes(binary: str, runtime: Path) -> list[dict[str, Any]]:

@@ -44,12 +44,10 @@ def record(wall: Wall, seconds: float, during: Callable[[], None] = lambda: None
     """Names the scene, starts a recording with Space and stops it so."""
     wall.page.fill("#scene", SCENE)
     wall.page.keyboard.press("Escape")
-    wall.page.keyboard.press("Space")
-    wall.wait_for_state("#record-state", "recording")
+    wall.press_record("recording")
     time.sleep(seconds)
     during()
-    wall.page.keyboard.press("Space")
-    wall.wait_for_state("#record-state", "idle")
+    wall.press_record("idle")
 
 
 def watch(wall: Wall, *streams: str) -> None:

@@ -1,7 +1,7 @@
 //! Global options, and parsers for option values that several commands share.
 
 use clap::{ArgAction, ValueEnum};
-use depthrig_bus::RigName;
+use depthrig_bus::{Name, RigName};
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
 
@@ -11,6 +11,9 @@ pub struct Global {
     /// Rig to use [default: the only one running]
     #[arg(long, global = true, value_name = "NAME", help_heading = "Global options")]
     pub rig: Option<RigName>,
+    /// Computer whose daemon to use, in a rig of several [default: this one]
+    #[arg(long, global = true, value_name = "NAME", help_heading = "Global options")]
+    pub host: Option<Name>,
     /// Folder with the locks and sockets of your rigs [env: DEPTHRIG_RUNTIME_DIR]
     #[arg(long, global = true, value_name = "DIR", help_heading = "Global options")]
     pub runtime_dir: Option<PathBuf>,

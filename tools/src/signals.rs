@@ -19,6 +19,11 @@ pub struct Stop {
 }
 
 impl Stop {
+    /// Set when the end is asked for.
+    pub fn flag(&self) -> &AtomicBool {
+        &self.asked
+    }
+
     /// Takes over SIGINT, SIGTERM and SIGXFSZ for the rest of the process's life.
     ///
     /// # Errors

@@ -1,5 +1,7 @@
 //! The status of a rig as text: what `status` prints and `top` refreshes.
 
+mod hosts;
+
 use crate::out;
 use crate::printable::{BOLD, GREEN, RED, RESET, YELLOW};
 use core::fmt::Write as _;
@@ -65,6 +67,7 @@ pub fn status(rig: &RigStatus, style: Style) -> String {
     lines.extend(rig.preparing.as_ref().map(|p| preparing(p, style)));
     lines.extend(rig.replay.iter().map(|r| format!("replay  {}", replay(r))));
     lines.extend(rig.link.iter().flat_map(|l| link(l, style)));
+    lines.extend(rig.hosts.iter().flat_map(|h| hosts::lines(h, style)));
     lines.extend(rig.recording.iter().flat_map(|r| recording(r, style)));
     lines.push(format!(
         "memory  /dev/shm {} free; {} slots a stream, {} in all",

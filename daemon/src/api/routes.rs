@@ -1,6 +1,7 @@
 //! The calls of the API: one table that the router is built from and the OpenAPI document is compared with.
 
 use super::events::{CaptureEvent, Events};
+use super::files::{self, BytesRequest, FileDigest, FileRequest, RecordingFiles};
 use super::page::{self, LIVE, PageAddress};
 use super::recordings::{self, MarkRequest, NameRequest, Recording, Recordings, ReportPage, Tickets};
 use super::reply::Refusal;
@@ -52,7 +53,7 @@ pub struct Route {
 const CALIBRATION_EVENTS: &str = "/v1/calibration/events";
 
 /// Every call of the API.
-pub const ROUTES: [Route; 35] = [
+pub const ROUTES: [Route; 38] = [
     Route { method: "GET", path: "/v1/status", handler: || get(status) },
     Route { method: "GET", path: "/v1/health", handler: || get(health) },
     Route { method: "GET", path: "/v1/config", handler: || get(config) },
@@ -67,6 +68,9 @@ pub const ROUTES: [Route; 35] = [
     Route { method: "GET", path: "/v1/recordings/image", handler: || get(recordings_image) },
     Route { method: "POST", path: "/v1/recordings/mark", handler: || post(recordings_mark) },
     Route { method: "POST", path: "/v1/recordings/report", handler: || post(recordings_report) },
+    Route { method: "POST", path: "/v1/recordings/files", handler: || post(recordings_files) },
+    Route { method: "POST", path: "/v1/recordings/bytes", handler: || post(recordings_bytes) },
+    Route { method: "POST", path: "/v1/recordings/digest", handler: || post(recordings_digest) },
     Route { method: "GET", path: "/v1/report/{ticket}", handler: || get(report) },
     Route { method: "GET", path: "/v1/doctor", handler: || get(doctor) },
     Route { method: "GET", path: "/v1/controls", handler: || get(controls) },
@@ -223,6 +227,22 @@ async fn recordings_report(
 ) -> Answer<Json<ReportPage>> {
     let of: NameRequest = parse(&body)?;
     call(rig, move |rig| tickets.issue(rig, &of.name)).await.map(Json)
+}
+
+async fn recordings_files(State(rig): State<Rig>, body: Bytes) -> Answer<Json<RecordingFiles>> {
+    let of: NameRequest = parse(&body)?;
+    call(rig, move |rig| files::list(rig, &of.name)).await.map(Json)
+}
+
+async fn recordings_bytes(State(rig): State<Rig>, body: Bytes) -> Answer<Response> {
+    let part: BytesRequest = parse(&body)?;
+    let bytes = call(rig, move |rig| files::bytes(rig, &part)).await?;
+    Ok(([(header::CONTENT_TYPE, "application/octet-stream")], bytes).into_response())
+}
+
+async fn recordings_digest(State(rig): State<Rig>, body: Bytes) -> Answer<Json<FileDigest>> {
+    let file: FileRequest = parse(&body)?;
+    call(rig, move |rig| files::digest(rig, &file)).await.map(Json)
 }
 
 async fn report(

@@ -129,6 +129,7 @@ pub(crate) fn rig_with(port: &str) -> RigStatus {
         replay: None,
         signals: Vec::new(),
         link: None,
+        hosts: None,
     }
 }
 

@@ -1,9 +1,10 @@
 //! The table `[link]`: the part of this computer in a rig of several.
 
 use super::read::{FromToml, Section};
-use super::{LinkConfig, LinkRole};
+use super::{HostConfig, LinkConfig, LinkRole, Reach};
 use depthrig_bus::Name;
 use std::net::SocketAddr;
+use std::path::PathBuf;
 
 /// Reads the table; `None` without one, and after a problem was noted.
 pub(super) fn read(top: &Section<'_, '_>) -> Option<LinkConfig> {
@@ -24,8 +25,74 @@ pub(super) fn read(top: &Section<'_, '_>) -> Option<LinkConfig> {
         );
         s.problem(s.at, what);
     }
+    let hosts = hosts(&s, host.as_ref().map(|h| &h.value), role);
     s.finish();
-    Some(LinkConfig { host: host?.value, role: role? })
+    Some(LinkConfig { host: host?.value, role: role?, hosts: hosts? })
+}
+
+/// The other computers; `None` after a problem was noted.
+fn hosts(link: &Section<'_, '_>, own: Option<&Name>, role: Option<LinkRole>) -> Option<Vec<HostConfig>> {
+    let mut hosts: Vec<HostConfig> = Vec::new();
+    let mut is_good = true;
+    for mut s in link.tables("hosts", "[[link.hosts]]")? {
+        let name = s.required::<Name>("name", "\"left\"");
+        if let Some(name) = &name {
+            s.set_name(name.value.as_str());
+            if hosts.iter().any(|h| h.name == name.value) || own == Some(&name.value) {
+                is_good = false;
+                s.problem(
+                    name.at,
+                    format!("host \"{}\" is named twice; each computer has a name of its own", name.value),
+                );
+            }
+        }
+        if matches!(role, Some(LinkRole::Camera(_))) {
+            is_good = false;
+            let what = "[[link.hosts]] goes with listen, into the rig file of the computer that records the session; this one has recorder";
+            s.problem(s.at, what);
+        }
+        let reach = reach(&s);
+        s.finish();
+        match (name, reach) {
+            (Some(name), Some(reach)) => hosts.push(HostConfig { name: name.value, reach }),
+            _ => is_good = false,
+        }
+    }
+    is_good.then_some(hosts)
+}
+
+fn reach(s: &Section<'_, '_>) -> Option<Reach> {
+    let ssh = s.get::<String>("ssh");
+    let socket = s.get::<PathBuf>("socket");
+    if let Some(path) = &socket
+        && !path.value.is_absolute()
+    {
+        s.problem(path.at, "socket must be a path that begins with /");
+        return None;
+    }
+    let socket = socket.map(|path| path.value);
+    match (ssh, socket) {
+        (Some(ssh), socket) => {
+            let destination = ssh.value;
+            if destination.is_empty()
+                || destination.starts_with('-')
+                || destination.contains(char::is_whitespace)
+            {
+                let what = format!(
+                    "ssh must be \"user@address\", or a Host of ~/.ssh/config; it is \"{destination}\""
+                );
+                s.problem(ssh.at, what);
+                return None;
+            }
+            Some(Reach::Ssh { destination, socket })
+        }
+        (None, Some(path)) => Some(Reach::Socket(path)),
+        (None, None) if s.has("ssh") || s.has("socket") => None,
+        (None, None) => {
+            s.problem(s.at, "[[link.hosts]] needs the key ssh, such as ssh = \"lab@10.0.0.2\"");
+            None
+        }
+    }
 }
 
 fn role(s: &Section<'_, '_>) -> Option<LinkRole> {

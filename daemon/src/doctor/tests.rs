@@ -600,7 +600,7 @@ fn two_kinects_need_more_memory_for_transfers_than_the_kernel_gives() {
 #[test]
 fn the_clock_of_the_session_is_asked_for_before_a_session() {
     use crate::config::{LinkConfig, LinkRole};
-    let link = |role| LinkConfig { host: "left".parse().unwrap(), role };
+    let link = |role| LinkConfig { host: "left".parse().unwrap(), role, hosts: Vec::new() };
     let found = |role| {
         let asked = super::link::ask(&link(role));
         let report = host_report(FILES, |h| h.link = Some(asked));

@@ -126,6 +126,7 @@ fn rig() -> RigStatus {
         replay: None,
         signals: Vec::new(),
         link: None,
+        hosts: None,
     }
 }
 

@@ -221,6 +221,7 @@ impl Control for Inner {
             cpu_cores: self.cpu_millicores.load(Ordering::Relaxed) as f64 / 1000.0,
             signals: Vec::new(),
             link: None,
+            hosts: None,
             replay: Some(self.replay_status()),
         }
     }

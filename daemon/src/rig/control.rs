@@ -87,15 +87,24 @@ impl Control for Inner {
         {
             tracing::warn!("the recording does not say which controls were changed: {e}");
         }
+        if let Some(hosts) = &self.hosts {
+            hosts.begin(&status, request);
+        }
         Ok(status)
     }
 
     fn record_stop(&self) -> Result<RecordingStatus> {
+        if let (Some(hosts), Some(active)) = (&self.hosts, self.recording().active_path()) {
+            hosts.end(&active);
+        }
         self.finish_held();
         let stopped = recording::stop(&self.recording);
         self.closing.store(false, Ordering::Relaxed);
         let status = stopped?;
         self.reports.begin(PathBuf::from(&status.path));
+        if let Some(hosts) = &self.hosts {
+            hosts.wait_ended();
+        }
         Ok(status)
     }
 

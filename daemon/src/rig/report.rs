@@ -34,6 +34,7 @@ pub fn status(inner: &Inner) -> RigStatus {
         cameras,
         signals,
         link: inner.link.as_ref().map(|link| link.status(now)),
+        hosts: inner.hosts.as_ref().map(|hosts| hosts.status()),
         sets: sets(inner),
         recording: recording(inner),
         shared_memory: SharedMemoryStatus {

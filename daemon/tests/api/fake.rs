@@ -5,9 +5,10 @@ use depthrig_daemon::control::{
     RecordingLosses, ReplayControl, SeekRequest, UncertaintyOfImage,
 };
 use depthrig_daemon::status::{
-    CameraState, CameraStatus, ClockStatus, LinkState, LinkStatus, PreparingStatus, RecordingStatus,
-    RefineState, RefineStatus, ReplayStatus, RigStatus, SetAccount, SetStatus, SharedMemoryStatus,
-    SignalState, SignalStatus, StreamStatus,
+    CameraState, CameraStatus, ClockStatus, HostState, HostStatus, HostsStatus, JoinState, LinkState,
+    LinkStatus, PartStatus, PreparingStatus, RecordingStatus, RefineState, RefineStatus, ReplayStatus,
+    RigStatus, SessionStatus, SetAccount, SetStatus, SharedMemoryStatus, SignalState, SignalStatus,
+    StreamStatus,
 };
 use depthrig_daemon::{Error, ErrorKind, Result};
 use depthrig_recorder::{Episode, EpisodeOutcome};
@@ -167,6 +168,31 @@ impl Fake {
                 age_s: Some(0.01),
                 exchanges: 100,
                 refused: 0,
+            }),
+            hosts: Some(HostsStatus {
+                hosts: vec![HostStatus {
+                    host: "top".into(),
+                    state: HostState::Refused,
+                    why: Some("its rig is \"other\"".into()),
+                    cameras: 3,
+                    streaming: 2,
+                    has_clock: true,
+                    recording: Some("kitchen_top".into()),
+                }],
+                session: Some(SessionStatus {
+                    name: "kitchen".into(),
+                    parts: vec![PartStatus {
+                        host: "top".into(),
+                        name: "kitchen_top".into(),
+                        bytes: 200,
+                        pulled_bytes: 100,
+                        is_complete: false,
+                        why: None,
+                    }],
+                    joined: JoinState::Waiting,
+                    dataset: None,
+                    why: None,
+                }),
             }),
             cameras: vec![
                 camera("d435", CameraState::Streaming, None),

@@ -67,6 +67,24 @@ pub fn edit(fs: &dyn Fs, dir: &Path, changes: &SessionChanges) -> Result<Vec<Edi
     file.save()
 }
 
+/// Gives the dataset `dir`, which was made of a recording, that recording's scene, operator, notes, episodes and judgement. Its times are those of
+/// the recording.
+///
+/// # Errors
+/// As [`edit`].
+pub fn adopt(fs: &dyn Fs, dir: &Path, recording: &Session) -> Result<()> {
+    let mut file = SessionText::open(fs, dir)?;
+    let session = &mut file.session;
+    session.scene.clone_from(&recording.scene);
+    session.operator.clone_from(&recording.operator);
+    session.notes.clone_from(&recording.notes);
+    session.episodes.clone_from(&recording.episodes);
+    session.mark = recording.mark;
+    let text = session.to_toml()?;
+    super::check_size(&text, &file.path)?;
+    fs::replace(fs, &file.path, text.as_bytes()).map_err(|e| Error::io("write", &file.path, e))
+}
+
 /// Renames the dataset `dir`: its folder, and the name in its session. Returns the new folder.
 ///
 /// # Errors

@@ -3,8 +3,12 @@
 use super::trim::report;
 use crate::context::Context;
 use crate::exit::Exit;
+use crate::out;
+use crate::signals::Stop;
 use crate::watched::watched;
 use anyhow::Result;
+use depthrig_daemon::hosts::parts_of;
+use depthrig_daemon::joining::join;
 use depthrig_recorder::fs::RealFs;
 use depthrig_recorder::{Dataset, SliceOptions, merge};
 use std::path::PathBuf;
@@ -21,7 +25,12 @@ sets between its first and last are missing (the output lists them).
 
 Examples:
   depthrig merge data/kitchen data/kitchen_start data/kitchen_end
-  depthrig merge data/rescued /mnt/disk1/seg_0000.mcap /mnt/disk2/seg_0001.mcap";
+  depthrig merge data/rescued /mnt/disk1/seg_0000.mcap /mnt/disk2/seg_0001.mcap
+  depthrig merge --hosts data/kitchen_joined data/kitchen             with the parts that were pulled of it
+  depthrig merge --hosts data/kitchen_joined data/kitchen /mnt/left/kitchen_left
+
+With --hosts the first input is that of the computer whose clock is the session's; scene, notes and episodes are taken from it, and OUT does not exist until
+it is verified and has every frame of the inputs.";
 
 /// Arguments.
 #[derive(Debug, clap::Args)]
@@ -31,6 +40,9 @@ pub struct MergeArgs {
     /// Dataset folders or segment files
     #[arg(required = true)]
     inputs: Vec<PathBuf>,
+    /// Inputs are what several computers recorded of one session: of each moment one set with the cameras of all
+    #[arg(long)]
+    hosts: bool,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -38,6 +50,9 @@ pub struct MergeArgs {
 
 /// Joins the parts and reports the result.
 pub fn run(args: &MergeArgs, context: &Context) -> Result<Exit> {
+    if args.hosts {
+        return join_hosts(args, context);
+    }
     let inputs = args.inputs.iter().map(|path| Dataset::open(path)).collect::<Result<Vec<_>, _>>()?;
     report(args.json, || {
         watched(context, |progress| {
@@ -45,4 +60,21 @@ pub fn run(args: &MergeArgs, context: &Context) -> Result<Exit> {
             merge(&RealFs, &inputs, &args.out, &SliceOptions::default(), &mut progress)
         })
     })
+}
+
+/// Joins what several computers recorded.
+fn join_hosts(args: &MergeArgs, context: &Context) -> Result<Exit> {
+    let stop = Stop::on_signals()?;
+    let inputs = match args.inputs.as_slice() {
+        [only] => core::iter::once(only.clone()).chain(parts_of(only)?).collect(),
+        several => several.to_vec(),
+    };
+    let sets = join(&inputs, &args.out, &context.runtime()?, stop.flag())?;
+    if args.json {
+        out::json(&serde_json::json!({ "path": args.out, "sets": sets, "inputs": inputs }))?;
+    } else {
+        let of = out::count(inputs.len() as u64, "computer");
+        out::line(format_args!("{}: {} of {of}", args.out.display(), out::count(sets, "set")))?;
+    }
+    Ok(Exit::Good)
 }

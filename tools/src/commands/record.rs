@@ -16,7 +16,9 @@ Examples:
   depthrig record start --scene kitchen --operator ada
   depthrig record start --for 10m       stops by itself; refused if the disk is too small
   depthrig record note \"the cup was moved\"
-  depthrig record stop        exit code 3 if the recording lost anything";
+  depthrig record stop        exit code 3 if the recording lost anything
+
+In a rig of several computers the others record when this one does; `start` ends with 3 when one of them does not.";
 
 /// Subcommands of `depthrig record`.
 #[derive(Debug, clap::Subcommand)]
@@ -87,7 +89,22 @@ pub fn run(command: &RecordCommand, context: &Context) -> Result<Exit> {
                 max_duration_s: args.duration_s,
                 force: args.force,
             };
-            print_status(&client.record_start(&request)?, args.json)
+            let status = client.record_start(&request)?;
+            let hosts = client.status()?.hosts.unwrap_or_default();
+            print_status(&status, args.json)?;
+            if args.json {
+                return Ok(if hosts.is_ill() { Exit::Lost } else { Exit::Good });
+            }
+            for host in &hosts.hosts {
+                match (&host.recording, &host.why) {
+                    (Some(part), None) => out::line(format_args!("host {}: recording {part}", host.host))?,
+                    (_, why) => {
+                        let why = why.as_deref().unwrap_or("records nothing yet");
+                        out::line(format_args!("host {}: {}", host.host, printable::line(why)))?;
+                    }
+                }
+            }
+            Ok(if hosts.is_ill() { Exit::Lost } else { Exit::Good })
         }
         RecordCommand::Stop { json } => {
             let status = client.record_stop()?;
@@ -110,7 +127,11 @@ pub fn run(command: &RecordCommand, context: &Context) -> Result<Exit> {
 
 /// Connects to the running daemon that `context` selects.
 pub fn connect(context: &Context) -> Result<Client> {
-    Ok(Client::connect(&context.runtime()?, context.global.rig.as_ref())?)
+    let runtime = context.runtime()?;
+    Ok(match &context.global.host {
+        Some(host) => Client::of_host(&runtime, &context.running_rig(&runtime)?, host)?,
+        None => Client::connect(&runtime, context.global.rig.as_ref())?,
+    })
 }
 
 fn print_status(status: &RecordingStatus, json: bool) -> Result<Exit> {

@@ -185,6 +185,7 @@ pub fn start(
     let options = RigOptions {
         serve_api,
         shows: shows.map(|shows| Arc::new(shows) as Arc<dyn Shows>),
+        join: Some(depthrig_daemon::joining::join),
         cache_dir,
         progress: Some(Box::new(progress)),
         // With an API, subscribers can query the rendering progress, so streaming starts at once.

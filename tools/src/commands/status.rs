@@ -7,11 +7,13 @@ use crate::view::{self, Style};
 use crate::{out, screen};
 use anyhow::Result;
 use core::time::Duration;
-use depthrig_daemon::status::{CameraState, CameraStatus, LinkState, RefineState, RigStatus, SignalState};
+use depthrig_daemon::status::{
+    CameraState, CameraStatus, HostsStatus, LinkState, RefineState, RigStatus, SignalState,
+};
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-Exit code 3 if a camera is not streaming, a required signal does not come, the clock of the session does not answer, depth that should be refined is not, or the recording lost anything.
+Exit code 3 if a camera is not streaming, a required signal does not come, the clock of the session or another computer does not answer, depth that should be refined is not, or the recording lost anything.
 
 Examples:
   depthrig status
@@ -59,6 +61,7 @@ fn exit(rig: &RigStatus) -> Exit {
     if lost
         || silent
         || adrift
+        || rig.hosts.as_ref().is_some_and(HostsStatus::is_ill)
         || !rig.cameras.iter().all(refined)
         || !rig.cameras.iter().all(|c| fine(c.state))
     {

@@ -69,6 +69,7 @@ fn rig() -> RigStatus {
         replay: None,
         signals: Vec::new(),
         link: None,
+        hosts: None,
     }
 }
 

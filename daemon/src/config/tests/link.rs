@@ -20,6 +20,45 @@ fn a_computer_listens_or_names_its_recorder() {
 }
 
 #[test]
+fn the_recorder_names_the_other_computers() {
+    let read = |hosts: &str| parse(&with(&format!("host = \"right\"\nlisten = \"127.0.0.1:7447\"\n{hosts}")));
+    let hosts = read(
+        "[[link.hosts]]\nname = \"left\"\nssh = \"lab@10.0.0.2\"\n[[link.hosts]]\nname = \"top\"\nssh = \"top\"\nsocket = \"/run/m.sock\"\n\
+         [[link.hosts]]\nname = \"far\"\nsocket = \"/run/far.sock\"",
+    );
+    let host = |name: &str, reach| HostConfig { name: name.parse().unwrap(), reach };
+    let ssh = |to: &str, socket: Option<&str>| Reach::Ssh {
+        destination: to.to_owned(),
+        socket: socket.map(Into::into),
+    };
+    let expected = [
+        host("left", ssh("lab@10.0.0.2", None)),
+        host("top", ssh("top", Some("/run/m.sock"))),
+        host("far", Reach::Socket("/run/far.sock".into())),
+    ];
+    assert_eq!(hosts.unwrap().link.unwrap().hosts, expected);
+    for (text, why) in [
+        ("[[link.hosts]]\nssh = \"left\"", "\"name\" is missing in [[link.hosts]]"),
+        ("[[link.hosts]]\nname = \"left\"", "needs the key ssh"),
+        ("[[link.hosts]]\nname = \"right\"\nssh = \"a\"", "host \"right\" is named twice"),
+        ("[[link.hosts]]\nname = \"a\"\nssh = \"-oProxyCommand=x\"", "ssh must be \"user@address\""),
+        ("[[link.hosts]]\nname = \"a\"\nssh = \"a b\"", "ssh must be \"user@address\""),
+        ("[[link.hosts]]\nname = \"a\"\nsocket = \"m.sock\"", "must be a path that begins with /"),
+        (
+            "[[link.hosts]]\nname = \"a\"\nsh = \"b\"\nssh = \"b\"",
+            "unknown key \"sh\" in [[link.hosts]] \"a\"",
+        ),
+        ("hosts = [\"left\"]", "must be written as tables, each headed [[link.hosts]]"),
+    ] {
+        let found = problems(&with(&format!("host = \"right\"\nlisten = \"127.0.0.1:7447\"\n{text}")));
+        assert!(found.iter().any(|p| p.contains(why)), "{text}: {found:?}");
+        assert_eq!(found.len(), 1, "{found:?}");
+    }
+    let asks = "host = \"left\"\nrecorder = \"127.0.0.1:7447\"\n[[link.hosts]]\nname = \"a\"\nssh = \"a\"";
+    assert!(problems(&with(asks))[0].contains("of the computer that records the session"));
+}
+
+#[test]
 fn what_is_wrong_with_a_link_is_named_with_its_cure() {
     for (text, why) in [
         ("listen = \"127.0.0.1:1\"", "\"host\" is missing in [link]"),

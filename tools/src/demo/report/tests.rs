@@ -106,6 +106,7 @@ fn status() -> RigStatus {
         cpu_cores: 0.0,
         replay: None,
         link: None,
+        hosts: None,
         signals: Vec::new(),
     }
 }

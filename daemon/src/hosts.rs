@@ -1,0 +1,334 @@
+//! The other computers of a rig: they record when this one does, and their parts are pulled and joined.
+//!
+//! Each of them runs a whole daemon that records its own cameras to its own disk, so that no image depends on a network. The daemon
+//! here speaks to theirs over their control sockets, which a tunnel or anything else brings to this computer
+//! ([`RuntimeDir::host_socket_path`]); this module knows sockets alone.
+//!
+//! ```text
+//! session  the recordings with parts elsewhere, and a file beside each that says so
+//! visit    what one look at a host's status leads to: begin, stop, pull
+//! pull     segments by ranges of bytes, resumed where they ended, compared at the end
+//! ```
+//!
+//! **Nothing is remembered that can be asked.** A thread for each host looks at its status, and does what it takes to come closer to what
+//! should be: a host that was away while a recording began gets a part later, and one that missed its end is stopped
+//! later, whoever was killed or cut off meanwhile.
+
+mod pull;
+mod session;
+#[cfg(test)]
+mod tests;
+mod visit;
+
+use crate::client::Client;
+use crate::config::{HostConfig, Reach, RigConfig};
+use crate::control::RecordRequest;
+use crate::recording::reserve_bytes;
+use crate::status::{CameraState, HostState, HostStatus, HostsStatus, JoinState, RecordingStatus, RigStatus};
+use crate::{Error, ErrorKind, Result};
+use core::time::Duration;
+use depthrig_bus::sync::lock;
+use depthrig_bus::{HostTime, RigName, RuntimeDir};
+use depthrig_link::{Remote, Tunnel};
+use depthrig_recorder::fs::RealFs;
+use depthrig_recorder::{Health, SESSION_FILE, look_at};
+use session::{Session, Sessions};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Condvar, Mutex, PoisonError};
+
+/// Makes one dataset of others ([`crate::joining`]).
+pub type JoinParts = fn(&[PathBuf], &Path, &RuntimeDir, &AtomicBool) -> Result<u64>;
+
+/// From one look at a host to the next while nothing is pulled from it.
+const LOOK: Duration = Duration::from_millis(500);
+/// A start and a stop wait so long for the hosts that answer; they go on behind it.
+const PATIENCE: Duration = Duration::from_secs(5);
+
+/// Folders of the parts that were pulled of the recording in `folder`.
+///
+/// # Errors
+/// `BadInput` when other computers have no parts of it, or not all of them are here.
+pub fn parts_of(folder: &Path) -> Result<Vec<PathBuf>> {
+    let folder = std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned());
+    let bad = |what: String| Error::new(ErrorKind::BadInput, what);
+    let none = || bad(format!("{} has no parts of other computers ({})", folder.display(), session::FILE));
+    let session = Session::read(&folder).filter(|s| !s.parts.is_empty()).ok_or_else(none)?;
+    if let Some(part) = session.parts.iter().find(|part| !part.is_complete) {
+        let what = "is not here completely; it is pulled while this rig and host";
+        return Err(bad(format!("part {} {what} {} run", part.name, part.host)));
+    }
+    Ok(session.part_folders().collect())
+}
+
+/// The other computers of a rig.
+#[derive(Debug)]
+pub struct Hosts {
+    others: Vec<Host>,
+    sessions: Mutex<Sessions>,
+    /// With `sessions`: something changed.
+    changed: Condvar,
+    runtime: RuntimeDir,
+    rig: RigName,
+    /// Cameras of this computer.
+    cameras: Vec<String>,
+    /// Room that pulled parts leave on the disk.
+    reserve_bytes: u64,
+    join: Option<JoinParts>,
+}
+
+#[derive(Debug)]
+struct Host {
+    config: HostConfig,
+    seen: Mutex<HostStatus>,
+    /// Cameras there, at the last look.
+    cameras: Mutex<Vec<String>>,
+}
+
+impl Hosts {
+    /// The computers of `config`, if it names any; `join` makes one dataset of the parts of a recording. Recordings whose parts
+    /// an earlier daemon did not pull are found again.
+    ///
+    /// # Errors
+    /// Those of a link to a socket that cannot be made.
+    pub fn new(config: &RigConfig, runtime: &RuntimeDir, join: Option<JoinParts>) -> Result<Option<Self>> {
+        let Some(link) = config.link.as_ref().filter(|link| !link.hosts.is_empty()) else { return Ok(None) };
+        for host in &link.hosts {
+            let here = runtime.host_socket_path(&config.rig, &host.name);
+            let _ = std::fs::remove_file(&here);
+            if let Reach::Socket(path) = &host.reach {
+                std::os::unix::fs::symlink(path, &here).map_err(|e| {
+                    let what = format!("host {}: {} cannot be made: {e}", host.name, here.display());
+                    Error::new(ErrorKind::Other, what).with_source(e)
+                })?;
+            }
+        }
+        let seen = |host: &HostConfig| HostStatus {
+            host: host.name.to_string(),
+            state: HostState::Absent,
+            why: Some("it was not asked yet".to_owned()),
+            cameras: 0,
+            streaming: 0,
+            has_clock: false,
+            recording: None,
+        };
+        Ok(Some(Self {
+            others: (link.hosts.iter())
+                .map(|h| Host { config: h.clone(), seen: Mutex::new(seen(h)), cameras: Mutex::default() })
+                .collect(),
+            sessions: Mutex::new(Sessions::left_in(&config.recording.directory)),
+            changed: Condvar::new(),
+            runtime: runtime.clone(),
+            rig: config.rig.clone(),
+            cameras: config.cameras.iter().map(|c| c.name.to_string()).collect(),
+            reserve_bytes: reserve_bytes(&config.recording),
+            join,
+        }))
+    }
+
+    /// How many there are; each has a thread of its own.
+    pub const fn count(&self) -> usize {
+        self.others.len()
+    }
+
+    /// State of the hosts, and of the newest recording.
+    pub fn status(&self) -> HostsStatus {
+        HostsStatus {
+            hosts: self.others.iter().map(|host| lock(&host.seen).clone()).collect(),
+            session: lock(&self.sessions).newest().map(Session::status),
+        }
+    }
+
+    /// The hosts get parts of a recording that has begun here. Returns when each that answers has one or says why not, after some
+    /// seconds at most.
+    pub fn begin(&self, here: &RecordingStatus, request: &RecordRequest) {
+        lock(&self.sessions).begin(here, request);
+        self.settle(|host, session| session.has_part(host) || session.excuse(host).is_some());
+    }
+
+    /// A recording ends here: the hosts end their parts at the same time.
+    pub fn end(&self, path: &Path) {
+        lock(&self.sessions).end(path);
+        self.changed.notify_all();
+    }
+
+    /// Waits until the hosts that answer have ended their parts, for some seconds at most.
+    pub fn wait_ended(&self) {
+        self.settle(|host, session| {
+            let recorded = lock(&host.seen).recording.clone();
+            !session.parts.iter().any(|part| recorded.as_deref() == Some(&part.name))
+        });
+    }
+
+    /// Wakes the threads of all hosts, and waits until `is_done` of each that is connected and the newest session.
+    fn settle(&self, is_done: impl Fn(&Host, &Session) -> bool) {
+        self.changed.notify_all();
+        let deadline = HostTime::now().plus(PATIENCE);
+        let mut sessions = lock(&self.sessions);
+        while !deadline.from_now().is_zero() {
+            let Some(session) = sessions.newest() else { return };
+            let is_away = |host: &Host| lock(&host.seen).state != HostState::Connected;
+            if self.others.iter().all(|host| is_away(host) || is_done(host, session)) {
+                return;
+            }
+            let waited = self.changed.wait_timeout(sessions, deadline.from_now().min(LOOK));
+            (sessions, _) = waited.unwrap_or_else(PoisonError::into_inner);
+        }
+    }
+
+    /// Keeps host `number` in step until `stop`. `active` is the folder that is being recorded into here.
+    ///
+    /// # Errors
+    /// When no client or tunnel can be made.
+    pub fn keep(&self, number: usize, active: &dyn Fn() -> Option<PathBuf>, stop: &AtomicBool) -> Result<()> {
+        let Some(host) = self.others.get(number) else { return Ok(()) };
+        let client = Client::of_host(&self.runtime, &self.rig, &host.config.name)?;
+        let tunnel = self.tunnel(host)?;
+        while !stop.load(Ordering::Relaxed) {
+            let mut sessions = lock(&self.sessions);
+            // Under the lock: a session is added after its recording has become active.
+            sessions.follow(active().as_deref());
+            drop(sessions);
+            let looked = client.status();
+            let is_new = self.note(host, looked.as_ref(), tunnel.as_ref());
+            let is_busy = match &looked {
+                Ok(status) if lock(&host.seen).state == HostState::Connected => {
+                    self.visit(host, &client, status, stop)
+                }
+                _ => false,
+            };
+            if is_new {
+                self.changed.notify_all();
+            }
+            if !is_busy {
+                let sessions = lock(&self.sessions);
+                drop(self.changed.wait_timeout(sessions, LOOK).unwrap_or_else(PoisonError::into_inner));
+            }
+        }
+        Ok(())
+    }
+
+    fn tunnel(&self, host: &Host) -> Result<Option<Tunnel>> {
+        let Reach::Ssh { destination, socket } = &host.config.reach else { return Ok(None) };
+        let here = self.runtime.host_socket_path(&self.rig, &host.config.name);
+        let remote = match socket {
+            Some(path) => Remote::Path(path.clone()),
+            None => Remote::InRuntimeDir(format!("{}.sock", self.rig)),
+        };
+        let tunnel = Tunnel::start(destination, &here, remote).map_err(|e| {
+            Error::new(ErrorKind::Other, format!("no thread for host {}: {e}", host.config.name))
+                .with_source(e)
+        })?;
+        Ok(Some(tunnel))
+    }
+
+    /// Writes down what a look at a host found; whether that is news.
+    fn note(&self, host: &Host, looked: Result<&RigStatus, &Error>, tunnel: Option<&Tunnel>) -> bool {
+        let name = &host.config.name;
+        let mut seen = HostStatus { host: name.to_string(), ..lock(&host.seen).clone() };
+        match looked {
+            Ok(status) => {
+                let cameras: Vec<_> = status.cameras.iter().map(|c| c.name.clone()).collect();
+                let refusal = self.refusal(host, status, &cameras);
+                seen.state = if refusal.is_some() { HostState::Refused } else { HostState::Connected };
+                seen.why = refusal.or_else(|| lock(&self.sessions).excuse(name));
+                seen.cameras = status.cameras.len();
+                seen.streaming = status.cameras.iter().filter(|c| c.state == CameraState::Streaming).count();
+                seen.has_clock = status.link.as_ref().is_some_and(|link| link.offset_s.is_some());
+                seen.recording = status.recording.as_ref().filter(|r| r.active).map(|r| r.name.clone());
+                *lock(&host.cameras) = cameras;
+            }
+            Err(e) => {
+                seen.state = HostState::Absent;
+                seen.why = Some(tunnel.and_then(Tunnel::why).unwrap_or_else(|| e.to_string()));
+                seen.streaming = 0;
+                seen.has_clock = false;
+                seen.recording = None;
+            }
+        }
+        let mut known = lock(&host.seen);
+        let before = known.state;
+        let is_new = *known != seen;
+        *known = seen.clone();
+        drop(known);
+        if before != seen.state {
+            match seen.state {
+                HostState::Connected => tracing::info!("host {name} answers: {} cameras", seen.cameras),
+                HostState::Absent | HostState::Refused => {
+                    tracing::error!("host {name}: {}", seen.why.unwrap_or_default());
+                }
+            }
+        }
+        is_new
+    }
+
+    /// Why a daemon that answers cannot be this host of the rig.
+    fn refusal(&self, host: &Host, status: &RigStatus, cameras: &[String]) -> Option<String> {
+        let name = &host.config.name;
+        if status.rig != self.rig.as_str() {
+            return Some(format!(
+                "its rig is \"{}\"; write rig = \"{}\" into its rig file",
+                status.rig, self.rig
+            ));
+        }
+        let Some(link) = &status.link else {
+            return Some(
+                "its rig file has no [link], so that its clock is unknown; write the table there".to_owned(),
+            );
+        };
+        if link.host != name.as_str() {
+            return Some(format!(
+                "its name is \"{}\"; write host = \"{name}\" into [link] of its rig file",
+                link.host
+            ));
+        }
+        if link.recorder.is_none() {
+            return Some(
+                "its rig file has listen in [link]; a session has one computer with listen".to_owned(),
+            );
+        }
+        let twice = |names: &[String]| cameras.iter().find(|c| names.contains(c)).cloned();
+        let others = self.others.iter().filter(|other| other.config.name != *name);
+        let shared = twice(&self.cameras).map(|c| (c, "this computer".to_owned())).or_else(|| {
+            others
+                .into_iter()
+                .find_map(|o| Some((twice(&lock(&o.cameras))?, format!("host {}", o.config.name))))
+        });
+        let (camera, where_) = shared?;
+        Some(format!("camera \"{camera}\" is a name on {where_}, too; give one of them another name"))
+    }
+
+    /// Joins the parts of recordings as they become complete, until `stop`.
+    pub fn join_complete(&self, stop: &AtomicBool) {
+        while !stop.load(Ordering::Relaxed) {
+            let Some(join) = self.join else { return };
+            let due = lock(&self.sessions).due(|folder| {
+                !matches!(look_at(&RealFs, folder).health, Health::Recording | Health::Unfinished)
+            });
+            let Some(session) = due else {
+                let sessions = lock(&self.sessions);
+                drop(self.changed.wait_timeout(sessions, LOOK).unwrap_or_else(PoisonError::into_inner));
+                continue;
+            };
+            let out = session.joined_folder();
+            if out.join(SESSION_FILE).is_file() {
+                // It gets its name when it is verified: an earlier daemon ended before it wrote that down.
+                lock(&self.sessions).joined(&session.name, JoinState::Done, None);
+                continue;
+            }
+            lock(&self.sessions).joined(&session.name, JoinState::Joining, None);
+            let inputs: Vec<_> =
+                core::iter::once(session.folder.clone()).chain(session.part_folders()).collect();
+            let ended = join(&inputs, &out, &self.runtime, stop);
+            if stop.load(Ordering::Relaxed) {
+                return;
+            }
+            match &ended {
+                Ok(sets) => tracing::info!("joined into {}: {sets} sets", out.display()),
+                Err(e) => tracing::error!("the parts of {} are not joined: {e}", session.name),
+            }
+            let state = if ended.is_ok() { JoinState::Done } else { JoinState::Failed };
+            lock(&self.sessions).joined(&session.name, state, ended.err().map(|e| e.to_string()));
+        }
+    }
+}

@@ -1,0 +1,133 @@
+//! Actions that follow from one look at a host.
+
+use super::pull::{Pull, Pulled};
+use super::session::Session;
+use super::{Host, Hosts};
+use crate::client::Client;
+use crate::status::RigStatus;
+use crate::{Error, Result};
+use core::time::Duration;
+use depthrig_bus::HostTime;
+use depthrig_bus::sync::lock;
+use std::sync::atomic::AtomicBool;
+
+/// Parts are pulled for so long before the host is looked at again.
+const PULL_FOR: Duration = Duration::from_millis(500);
+
+impl Hosts {
+    /// Begins and ends parts on a host that was just looked at, and pulls some of them. Returns whether there is more to pull.
+    pub(super) fn visit(&self, host: &Host, client: &Client, status: &RigStatus, stop: &AtomicBool) -> bool {
+        let name = &host.config.name;
+        let recorded = status.recording.as_ref().filter(|r| r.active).map(|r| r.name.as_str());
+        if let Some(part) = recorded
+            && lock(&self.sessions).is_over(part)
+        {
+            match client.record_stop() {
+                Ok(_) => self.recorded(host, None),
+                Err(e) => tracing::warn!("host {name} does not end its part {part} yet: {e}"),
+            }
+            self.changed.notify_all();
+        }
+        let mut is_busy = false;
+        let sessions = lock(&self.sessions).of(name);
+        for session in &sessions {
+            if session.goes_on && !session.parts.iter().any(|p| recorded == Some(&p.name)) {
+                self.begin_part(host, client, session, recorded);
+            }
+            for part in session.parts.iter().filter(|p| p.host == *name && !p.is_complete) {
+                let pull = Pull {
+                    client,
+                    name: &part.name,
+                    folder: session.part_folder(&part.name),
+                    reserve_bytes: self.reserve_bytes,
+                    until: HostTime::now().plus(PULL_FOR),
+                    stop,
+                };
+                is_busy |= self.pulled(host, session, &part.name, pull.run());
+                if !session.goes_on && !is_busy && recorded != Some(&part.name) {
+                    self.left_open(session, &part.name);
+                }
+            }
+        }
+        is_busy
+    }
+
+    /// Writes down the part that the host records now, before it is looked at again.
+    fn recorded(&self, host: &Host, part: Option<String>) {
+        lock(&host.seen).recording = part;
+        self.changed.notify_all();
+    }
+
+    fn begin_part(&self, host: &Host, client: &Client, session: &Session, recorded: Option<&str>) {
+        let name = &host.config.name;
+        if let Some(other) = recorded {
+            let what = format!(
+                "it records {other}, which is no part of this recording; depthrig --host {name} record stop ends it"
+            );
+            lock(&self.sessions).excuse_of(&session.name, name, what);
+            self.changed.notify_all();
+            return;
+        }
+        let request = session.part_request(name);
+        let Some(part) = request.name.clone() else { return };
+        // Written down first: a part that begins is then known, whatever happens to the answer.
+        lock(&self.sessions).add(&session.name, name, &part);
+        match client.record_start(&request) {
+            Ok(status) => {
+                tracing::info!("host {name} records {}", status.name);
+                self.recorded(host, Some(status.name));
+            }
+            // It may have begun all the same: the next look says so.
+            Err(e) if e.kind() == crate::ErrorKind::Unreachable => {
+                tracing::warn!("host {name} did not say whether it records {part}: {e}");
+            }
+            Err(e) => {
+                let what = format!("it records nothing: {e}");
+                let mut sessions = lock(&self.sessions);
+                if sessions.excuse(name).as_ref() != Some(&what) {
+                    tracing::error!("host {name}: {what}");
+                }
+                sessions.take_back(&session.name, name, &part, what);
+            }
+        }
+        self.changed.notify_all();
+    }
+
+    /// A part that nobody records is incomplete because nobody closed it: its daemon was killed, and recovers it after its start.
+    fn left_open(&self, session: &Session, part: &str) {
+        lock(&self.sessions).change(&session.name, part, |part| {
+            if !part.is_complete && part.why.is_none() {
+                let what = "it was not closed there yet, which its daemon does; if it does not, call there: depthrig recover";
+                part.why = Some(what.to_owned());
+            }
+        });
+    }
+
+    /// Writes down how far a part has come; whether there is more of it.
+    fn pulled(&self, host: &Host, session: &Session, part: &str, pulled: Result<Pulled>) -> bool {
+        let Pulled { bytes, copied, is_complete, is_busy } = match pulled {
+            Ok(pulled) => pulled,
+            Err(e) => {
+                lock(&self.sessions).change(&session.name, part, |part| part.why = Some(said(host, &e)));
+                return false;
+            }
+        };
+        if is_complete {
+            tracing::info!("part {part} of host {} is here: {bytes} bytes", host.config.name);
+        }
+        lock(&self.sessions).change(&session.name, part, |part| {
+            part.bytes = bytes;
+            part.pulled_bytes = copied;
+            part.is_complete = is_complete;
+            part.why = None;
+        });
+        if is_complete {
+            self.changed.notify_all();
+        }
+        is_busy
+    }
+}
+
+fn said(host: &Host, e: &Error) -> String {
+    format!("host {}: {e}", host.config.name)
+}

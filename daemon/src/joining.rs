@@ -1,0 +1,144 @@
+//! Makes one dataset of the parts of a recording that several computers made.
+//!
+//! The parts are replayed on channels of their own, without a frame left out, and that replay is recorded: the sets of one tick become one
+//! set, images stay as they were stored, and times are those of the session's clock ([`crate::replay`]). The dataset grows in a hidden
+//! folder and gets its name when it is verified and has every frame of the parts.
+
+use crate::control::RecordRequest;
+use crate::replay::{Replay, ReplayOptions};
+use crate::{Error, ErrorKind, Result};
+use core::ops::ControlFlow;
+use core::time::Duration;
+use depthrig_bus::{RuntimeDir, umask};
+use depthrig_recorder::fs::{Fs, RealFs};
+use depthrig_recorder::{Dataset, Severity, VerifyOptions, adopt, verify_watched};
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// The folder beside the recordings in which a joined dataset grows.
+const FOLDER: &str = ".joining";
+/// The folder of the replay's channels, below that of the user's rigs.
+const CHANNELS: &str = "joining";
+/// From one look whether to stop to the next.
+const LOOK: Duration = Duration::from_millis(100);
+
+/// Joins `parts`, that of the computer whose clock is the session's first, into the new dataset `out`; the number of its sets. Its name, scene,
+/// notes and episodes are those of the first part. The parts stay as they are.
+///
+/// # Errors
+/// `InUse` when `out` exists or another session is being joined, `BadInput` when the parts do not belong together, `NoSpace`, and `Other` when it was
+/// stopped, or when the result is not what it should be; `out` does not exist then.
+pub fn join(parts: &[PathBuf], out: &Path, runtime: &RuntimeDir, stop: &AtomicBool) -> Result<u64> {
+    if out.symlink_metadata().is_ok() {
+        let what = format!("{} exists; a joined dataset is a new one", out.display());
+        return Err(Error::new(ErrorKind::InUse, what));
+    }
+    let (Some(first), Some(name)) = (parts.first(), out.file_name().and_then(|n| n.to_str())) else {
+        return Err(Error::new(
+            ErrorKind::BadInput,
+            "name the datasets to join, and a new folder for the result",
+        ));
+    };
+    let channels = RuntimeDir::at(&runtime.path().join(CHANNELS))?;
+    let hidden = out.with_file_name(FOLDER);
+    let failed = |path: &Path, e: std::io::Error| {
+        Error::new(ErrorKind::Other, format!("{}: {e}", path.display())).with_source(e)
+    };
+    umask::create_dir_all(&hidden).map_err(|e| failed(&hidden, e))?;
+    let growing = hidden.join(name);
+    let options = ReplayOptions {
+        as_fast_as_possible: true,
+        in_background: true,
+        paused: true,
+        ..ReplayOptions::default()
+    };
+    // It takes the lock of the channels: what lies in the hidden folder is nobody's.
+    let replay = Replay::start(parts, &channels, None, options)?;
+    let recorded =
+        remove(&growing).map_err(|e| failed(&growing, e)).and_then(|()| record(replay, &hidden, name, stop));
+    let checked = recorded.and_then(|()| {
+        adopt(&RealFs, &growing, Dataset::open(first)?.session())?;
+        check(parts, &growing, stop)
+    });
+    if checked.is_ok() {
+        fs::rename(&growing, out).map_err(|e| failed(out, e))?;
+    } else if let Err(e) = remove(&growing) {
+        tracing::warn!("{} is left: {e}", growing.display());
+    }
+    // Another session's result may be in it.
+    let _ = fs::remove_dir(&hidden);
+    checked
+}
+
+fn remove(folder: &Path) -> std::io::Result<()> {
+    match fs::remove_dir_all(folder) {
+        Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(e),
+        _ => Ok(()),
+    }
+}
+
+/// Records the replay to its end.
+fn record(replay: Replay, directory: &Path, name: &str, stop: &AtomicBool) -> Result<()> {
+    let control = replay.control();
+    // The parts were measured against the disk before; how fast a replay writes says nothing about how long the disk lasts.
+    let request = RecordRequest {
+        directory: Some(directory.to_owned()),
+        name: Some(name.to_owned()),
+        force: true,
+        ..RecordRequest::default()
+    };
+    control.record_start(&request)?;
+    if let Some(replay) = control.replay() {
+        replay.resume()?;
+    }
+    while !replay.wait(LOOK) {
+        if stop.load(Ordering::Relaxed) {
+            return Err(stopped());
+        }
+    }
+    let summary = replay.stop();
+    let recording = summary.recording.unwrap_or_default();
+    let dropped = recording.dropped.iter().map(|(reason, n)| format!("{n} sets: {reason}"));
+    let lost: Vec<_> = summary.status.lost.into_iter().chain(recording.error).chain(dropped).collect();
+    if lost.is_empty() {
+        return Ok(());
+    }
+    Err(Error::new(ErrorKind::Other, format!("not all of the parts arrived: {}", lost.join("; "))))
+}
+
+fn stopped() -> Error {
+    Error::new(ErrorKind::Other, "stopped before it was done; the parts are as they were")
+}
+
+/// The result is sound, and has every frame of each part.
+fn check(parts: &[PathBuf], joined: &Path, stop: &AtomicBool) -> Result<u64> {
+    let fs: Arc<dyn Fs> = Arc::new(RealFs);
+    let report = verify_watched(&fs, joined, &VerifyOptions::default(), &mut |_| {
+        if stop.load(Ordering::Relaxed) { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    })?;
+    if report.stopped {
+        return Err(stopped());
+    }
+    if let Some(bad) = report.findings.iter().find(|f| f.severity == Severity::Broken) {
+        let what = format!("the joined dataset is not sound, which is an error of depthrig: {}", bad.message);
+        return Err(Error::new(ErrorKind::Other, what));
+    }
+    let mut expected = BTreeMap::new();
+    for part in parts {
+        for stream in Dataset::open(part)?.info()?.streams {
+            *expected.entry(stream.stream).or_insert(0) += stream.frames;
+        }
+    }
+    let streams = Dataset::open(joined)?.info()?.streams;
+    let found: BTreeMap<_, _> = streams.into_iter().map(|s| (s.stream, s.frames)).collect();
+    if let Some((stream, n)) = expected.iter().find(|(stream, n)| found.get(*stream) != Some(n)) {
+        let has = found.get(stream).copied().unwrap_or_default();
+        let what =
+            format!("the joined dataset has {has} of {n} frames of {stream}, which is an error of depthrig");
+        return Err(Error::new(ErrorKind::Other, what));
+    }
+    Ok(report.sets)
+}

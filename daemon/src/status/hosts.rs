@@ -1,0 +1,99 @@
+//! The other computers of a rig, as the one that records sees them.
+
+use serde::{Deserialize, Serialize};
+
+/// The other computers, and what became of their parts of the newest recording.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct HostsStatus {
+    /// In the order of the rig file.
+    pub hosts: Vec<HostStatus>,
+    /// The newest recording that they have parts of; `None` before the first.
+    pub session: Option<SessionStatus>,
+}
+
+impl HostsStatus {
+    /// Whether a computer is away or refused, or has no part of a recording that goes on.
+    pub fn is_ill(&self) -> bool {
+        self.hosts.iter().any(|host| host.state != HostState::Connected || host.why.is_some())
+            || self.session.as_ref().is_some_and(|s| s.joined == JoinState::Failed)
+    }
+}
+
+/// Another computer of the rig.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct HostStatus {
+    /// Its name in the rig.
+    pub host: String,
+    /// Whether its daemon answers.
+    pub state: HostState,
+    /// The fault and its cure; `None` if all is well.
+    pub why: Option<String>,
+    /// Its cameras.
+    pub cameras: usize,
+    /// Those that stream.
+    pub streaming: usize,
+    /// The session's clock is known there.
+    pub has_clock: bool,
+    /// The recording that goes on there.
+    pub recording: Option<String>,
+}
+
+/// Whether the daemon of another computer answers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum HostState {
+    /// It does.
+    Connected,
+    /// It does not; capture and recording go on here, and there.
+    #[default]
+    Absent,
+    /// It answers and cannot be part of this rig.
+    Refused,
+}
+
+/// A recording of several computers.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SessionStatus {
+    /// Name of the recording on this computer.
+    pub name: String,
+    /// Parts that other computers recorded.
+    pub parts: Vec<PartStatus>,
+    /// Whether all are one dataset.
+    pub joined: JoinState,
+    /// Name of that dataset.
+    pub dataset: Option<String>,
+    /// Why they are not.
+    pub why: Option<String>,
+}
+
+/// The part of a recording that another computer made.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct PartStatus {
+    /// The computer.
+    pub host: String,
+    /// Name of the recording, there and here.
+    pub name: String,
+    /// Bytes there so far.
+    pub bytes: u64,
+    /// Bytes of them that are here.
+    pub pulled_bytes: u64,
+    /// All are here, and equal.
+    pub is_complete: bool,
+    /// Why it does not go on.
+    pub why: Option<String>,
+}
+
+/// Whether the parts of a recording are one dataset.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum JoinState {
+    /// Not yet: the recording goes on, or a part is not here.
+    #[default]
+    Waiting,
+    /// It is being written.
+    Joining,
+    /// They are, and it was verified.
+    Done,
+    /// They could not be joined; the parts are as they were.
+    Failed,
+}

@@ -1,0 +1,160 @@
+"""The paper's split in two namespaces of one computer: seven cameras, four here and three there, a wire that is cut in the middle, one dataset.
+
+    tests/link/demo.py DEPTHRIG [--seconds S] [--cut S] [--rate 1gbit] [--keep DIR]
+
+Prints what was recorded, lost, pulled and joined, and ends with 1 if anything is missing. `tools/demo-two-hosts.sh` builds depthrig first.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from hosts import TwoHosts, wait_for, why_not
+
+# Not a whole number of periods of frame sets, which would hide a grid that is off.
+SHIFT_NS = 1_234_567_890_123
+HERE_CAMERAS = 4
+RENDER_S = 600.0
+
+
+class Side:
+    """A computer with its daemon."""
+
+    def __init__(self, hosts: TwoHosts, binary: str, host: str, name: str, folder: Path, runtime: Path) -> None:
+        self.hosts, self.binary, self.host, self.name = hosts, binary, host, name
+        self.data = folder / name
+        self.runtime = runtime / name
+        self.runtime.mkdir(mode=0o700)
+        self.rig_file = folder / f"{name}.toml"
+        self.log = folder / f"{name}.log"
+
+    def ask(self, *arguments: str, codes: tuple[int, ...] = (0,)) -> str:
+        return self.hosts.run(self.host, self.binary, *arguments, codes=codes, DEPTHRIG_RUNTIME_DIR=str(self.runtime))
+
+    def status(self) -> dict:
+        return json.loads(self.ask("status", "--json", codes=(0, 3)))
+
+    def start(self) -> None:
+        self.hosts.start(self.host, self.log, self.binary, "run", str(self.rig_file), DEPTHRIG_RUNTIME_DIR=str(self.runtime))
+
+    def is_ready(self) -> bool:
+        try:
+            status = self.status()
+        except AssertionError:
+            return False
+        return status["preparing"] is None and all(c["state"] == "streaming" for c in status["cameras"])
+
+
+def split(config: str, right: Side, left: Side, ssh: str) -> None:
+    """The rig files of both computers, from one of all cameras."""
+    top, *cameras = config.split("\n[[camera]]")
+    lines = [line for line in top.splitlines() if line and not line.startswith("#")]
+    link = {
+        right.name: f'listen = "10.77.0.1:7447"\n[[link.hosts]]\nname = "{left.name}"\nssh = "{ssh}"\nsocket = "{left.runtime}/mount.sock"',
+        left.name: 'recorder = "10.77.0.1:7447"',
+    }
+    parts = {right.name: cameras[:HERE_CAMERAS], left.name: cameras[HERE_CAMERAS:]}
+    for side in (right, left):
+        text = []
+        for line in lines:
+            text.append(line)
+            if line == "[recording]":
+                text += [f'directory = "{side.data}"', "min_minutes = 0"]
+            elif line == "[control]":
+                text.append('tcp = "off"')
+        text += ["[link]", f'host = "{side.name}"', "insecure = true", link[side.name]]
+        side.rig_file.write_text("\n".join(text) + "\n" + "".join(f"\n[[camera]]{camera}" for camera in parts[side.name]))
+
+
+def row(name: str, info: dict) -> str:
+    spread = info["spread"]
+    frames = sum(stream["frames"] for stream in info["streams"])
+    sets = f"{info['sets']:5} {info['sets'] - info['incomplete_sets']:9} {frames:7}"
+    return f"  {name:14} {len(info['streams']):7} {sets} {spread['p50_ns'] / 1e6:8.1f} {spread['max_ns'] / 1e6:8.1f} {info['bytes'] / 1e6:9.1f}"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("binary")
+    parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--cut", type=float, default=5.0)
+    parser.add_argument("--rate", default="1gbit")
+    parser.add_argument("--keep", type=Path)
+    options = parser.parse_args()
+    if why := why_not():
+        print(f"skipped: {why}")
+        return 0
+    folder = options.keep or Path(tempfile.mkdtemp(prefix="depthrig-two-"))
+    folder.mkdir(parents=True, exist_ok=True)
+    runtime = Path(tempfile.mkdtemp(prefix="d2", dir="/tmp"))
+    try:
+        with TwoHosts(folder, "--shift", str(SHIFT_NS), "--rate", options.rate) as hosts:
+            return session(hosts, options, folder, runtime)
+    finally:
+        shutil.rmtree(runtime, ignore_errors=True)
+        if options.keep is None:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def session(hosts: TwoHosts, options: argparse.Namespace, folder: Path, runtime: Path) -> int:
+    right = Side(hosts, options.binary, "here", "right", folder, runtime)
+    left = Side(hosts, options.binary, "there", "left", folder, runtime)
+    split(right.ask("config", "show"), right, left, hosts.serve_ssh())
+    right.start()
+    left.start()
+    print("two computers, clocks 1234.567890123 s apart; rendering what the cameras see (kept for next time)", flush=True)
+    wait_for("the cameras", lambda: right.is_ready() and left.is_ready(), RENDER_S)
+    link = lambda: right.status()["hosts"]["hosts"][0]  # noqa: E731
+    wait_for("the other computer", lambda: link()["has_clock"])
+    clock = left.status()["link"]
+    error_us = (clock["offset_s"] * 1e9 + SHIFT_NS) / 1e3
+    print(f"clock: {clock['offset_s']:+.6f} s within {clock['uncertainty_us']:.0f} us; truth is {error_us:+.1f} us away", flush=True)
+
+    print(right.ask("record", "start", "--name", "demo", "--scene", "table"), end="", flush=True)
+    time.sleep((options.seconds - options.cut) / 2)
+    lost_s = back_s = 0.0
+    if options.cut > 0:
+        begun = time.monotonic()
+        hosts.cut()
+        wait_for("the cut is seen", lambda: link()["state"] == "absent")
+        lost_s = time.monotonic() - begun
+        time.sleep(max(0.0, options.cut - lost_s))
+        begun = time.monotonic()
+        hosts.heal()
+        wait_for("the wire is back", lambda: link()["state"] == "connected")
+        back_s = time.monotonic() - begun
+        print(f"wire cut for {options.cut:.1f} s: seen after {lost_s:.1f} s, back {back_s:.1f} s after it was whole", flush=True)
+    time.sleep((options.seconds - options.cut) / 2)
+    print(right.ask("record", "stop", codes=(0, 3)), end="", flush=True)
+    begun = time.monotonic()
+    parts = lambda: right.status()["hosts"]["session"]["parts"]  # noqa: E731
+    wait_for("the part", lambda: all(part["is_complete"] for part in parts()), 10 * options.seconds)
+    pulled_s = time.monotonic() - begun
+    wait_for("the joined dataset", lambda: right.status()["hosts"]["session"]["joined"] not in ("waiting", "joining"), 600)
+    joined_s = time.monotonic() - begun
+    print(right.ask("status", codes=(0, 3)).split("\n\n")[0])
+
+    info = {name: json.loads(right.ask("info", "--json", str(right.data / name))) for name in ("demo", "demo_left", "demo_joined")}
+    print(f"\n  {'dataset':14} {'streams':>7} {'sets':>5} {'complete':>9} {'frames':>7} {'p50 ms':>8} {'max ms':>8} {'MB':>9}")
+    for name, title in (("demo", "right's part"), ("demo_left", "left's part"), ("demo_joined", "joined")):
+        print(row(title, info[name]))
+    print(f"  pulled {pulled_s:.1f} s and joined {joined_s:.1f} s after the end of {options.seconds:.0f} s\n", flush=True)
+    findings = json.loads(right.ask("verify", "--json", str(right.data / "demo_joined"), codes=(0, 1, 3)))["findings"]
+    for finding in findings:
+        print(f"  {finding['severity']}: {finding['message']}")
+    print(right.ask("replay", "--rig", "again", str(right.data / "demo_joined"), "--as-fast-as-possible", "-q"), end="")
+    frames = {name: sum(stream["frames"] for stream in of["streams"]) for name, of in info.items()}
+    if frames["demo"] + frames["demo_left"] != frames["demo_joined"]:
+        print("frames are missing in the joined dataset", file=sys.stderr)
+        return 1
+    return 1 if any(finding["severity"] == "broken" for finding in findings) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

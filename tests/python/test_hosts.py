@@ -1,0 +1,295 @@
+"""A session of two computers: one start, parts pulled over OpenSSH, cut wires and killed daemons, one joined dataset."""
+
+from __future__ import annotations
+
+import filecmp
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from test_daemon import CAMERAS, DATA, ROOT, WAIT_S, binary  # noqa: F401
+from test_two_hosts import messages
+
+sys.path.insert(0, str(ROOT / "tests/link"))
+from hosts import TwoHosts, wait_for, why_not
+
+HOST_CAMERAS = {"here": CAMERAS[:2], "there": CAMERAS[3:]}
+NAMES = {"here": "right", "there": "left"}
+
+
+class Rig:
+    """A daemon on each of two computers, and what one says to them."""
+
+    def __init__(self, hosts: TwoHosts, binary: str, folder: Path, runtime: Path) -> None:  # noqa: F811
+        self.hosts = hosts
+        self.binary = binary
+        self.folder = folder
+        self.runtime = {host: runtime / host for host in NAMES}
+        self.daemons: dict[str, subprocess.Popen[bytes]] = {}
+        for path in self.runtime.values():
+            path.mkdir(mode=0o700)
+        left = self.runtime["there"] / "mount.sock"
+        ssh = hosts.serve_ssh()
+        links = {
+            "here": f'listen = "10.77.0.1:7447"\n[[link.hosts]]\nname = "left"\nssh = "{ssh}"\nsocket = "{left}"',
+            "there": 'recorder = "10.77.0.1:7447"',
+        }
+        for host, name in NAMES.items():
+            lines = ['rig = "mount"', "[link]", f'host = "{name}"', "insecure = true", links[host]]
+            lines += ["[control]", 'tcp = "off"', "[recording]", f'directory = "{self.data(host)}"']
+            lines += ["reserve_mb = 64", "min_minutes = 0"]
+            for camera in HOST_CAMERAS[host]:
+                manifest = json.dumps(str(ROOT / "tests" / "data" / f"{camera.name}.toml"))
+                lines += ["[[camera]]", f'name = "{camera.name}"', 'backend = "files"', f"manifest = {manifest}"]
+            self.rig_file(host).write_text("\n".join(lines) + "\n")
+
+    def rig_file(self, host: str) -> Path:
+        return self.folder / f"{host}.toml"
+
+    def data(self, host: str) -> Path:
+        return self.folder / host
+
+    def log(self, host: str) -> str:
+        return (self.folder / f"{host}.log").read_text()
+
+    def start(self, host: str) -> None:
+        self.daemons[host] = self.hosts.start(
+            host,
+            self.folder / f"{host}.log",
+            self.binary,
+            "run",
+            str(self.rig_file(host)),
+            DEPTHRIG_RUNTIME_DIR=str(self.runtime[host]),
+            DEPTHRIG_TEST_DATA=str(DATA),
+        )
+        if host == "there":
+            self.wait_for_host("connected")
+        else:
+            wait_for("the daemon here", lambda: self.ask("status", codes=(0, 1, 3)))
+
+    def kill(self, host: str) -> None:
+        self.daemons[host].send_signal(signal.SIGKILL)
+        self.daemons[host].wait()
+
+    def ask(self, *arguments: str, host: str = "here", codes: tuple[int, ...] = (0,)) -> str:
+        command = (self.binary, *arguments)
+        return self.hosts.run(host, *command, codes=codes, DEPTHRIG_RUNTIME_DIR=str(self.runtime[host]))
+
+    def status(self, host: str = "here") -> dict[str, Any]:
+        return json.loads(self.ask("status", "--json", host=host, codes=(0, 3)))
+
+    def host(self) -> dict[str, Any]:
+        (left,) = self.status()["hosts"]["hosts"]
+        return left
+
+    def wait_for_host(self, state: str, seconds: float = WAIT_S) -> dict[str, Any]:
+        def found() -> dict[str, Any] | None:
+            left = self.host()
+            return left if left["state"] == state else None
+
+        return wait_for(f"host left is {state}: {self.host()}", found, seconds)
+
+    def session(self) -> dict[str, Any]:
+        return self.status()["hosts"]["session"]
+
+    def joined(self) -> Path:
+        """The dataset of the newest session, when it is joined."""
+
+        def found() -> str | None:
+            session = self.session()
+            assert session["joined"] != "failed", session
+            return session["dataset"]
+
+        return self.data("here") / str(wait_for("joined", found))
+
+
+@pytest.fixture
+def rig(binary: str, tmp_path: Path) -> Iterator[Rig]:  # noqa: F811
+    if why := why_not():
+        pytest.skip(why)
+    runtime = Path(subprocess.run(["mktemp", "-d", "/tmp/hXXXX"], capture_output=True, text=True, check=True).stdout.strip())
+    # The server's user is another one where the tests run as root.
+    for folder in (tmp_path, runtime):
+        os.chmod(folder, 0o700)
+    with TwoHosts(tmp_path, "--shift", "1234567890123") as hosts:
+        yield Rig(hosts, binary, tmp_path, runtime)
+
+
+def images(dataset: Path) -> dict[str, list[bytes]]:
+    found: dict[str, list[bytes]] = {}
+    for topic, value, _ in messages(dataset):
+        if hasattr(value, "data") and hasattr(value, "header"):
+            found.setdefault(topic, []).append(bytes(value.data))
+    return found
+
+
+def check_joined(rig: Rig, joined: Path, own: Path, parts: list[Path]) -> None:
+    """Every image of all parts is in the joined dataset, and each part here is that of its computer."""
+    for part in parts:
+        there = rig.data("there") / part.name
+        files = sorted(p.name for p in there.iterdir() if p.suffix == ".mcap" or p.name == "session.toml")
+        assert filecmp.cmpfiles(there, part, files, shallow=False) == (files, [], [])
+    expected = images(own)
+    for part in parts:
+        for topic, data in images(part).items():
+            expected.setdefault(topic, []).extend(data)
+    assert images(joined) == expected
+    findings = json.loads(rig.ask("verify", "--decode", "--json", str(joined), codes=(0, 3)))["findings"]
+    assert [f for f in findings if f["severity"] == "broken"] == []
+    assert not (rig.data("here") / ".pulling").exists()
+    assert not (rig.data("here") / ".joining").exists()
+
+
+def test_one_start_records_both_and_their_parts_become_one_dataset(rig: Rig) -> None:
+    rig.start("here")
+    rig.start("there")
+    wait_for("the clock", lambda: rig.host()["has_clock"])
+    said = rig.ask("record", "start", "--name", "kitchen", "--scene", "kitchen", "--operator", "ada")
+    assert "host left: recording kitchen_left" in said
+    assert rig.status("there")["recording"]["name"] == "kitchen_left"
+    rig.ask("record", "note", "the cup was moved")
+    rig.ask("episode", "start", "--task", "pour")
+    time.sleep(4)
+    # Parts are pulled while they are recorded.
+    wait_for("bytes", lambda: rig.session()["parts"][0]["pulled_bytes"] > 0)
+    # What speaks to a daemon speaks to the other one in the same way.
+    assert json.loads(rig.ask("status", "--json", "--host", "left"))["link"]["host"] == "left"
+    rig.ask("episode", "stop")
+    rig.ask("record", "stop")
+    assert not rig.status("there")["recording"]["active"]
+    joined = rig.joined()
+    own, part = (rig.data("here") / name for name in ("kitchen", "kitchen_left"))
+    check_joined(rig, joined, own, [part])
+    session = tomllib.loads((joined / "session.toml").read_text())
+    assert (session["scene"], session["operator"]) == ("kitchen", "ada")
+    assert [n["text"] for n in session["notes"]] == ["the cup was moved"]
+    assert [e["task"] for e in session["episodes"]] == ["pour"]
+    full = [v for topic, v, _ in messages(joined) if topic == "/mount/frame_set" and not v.missing]
+    assert len(full) >= 15
+    # By hand the same comes out again, and nothing that exists is overwritten.
+    again = rig.folder / "again"
+    rig.ask("merge", "--hosts", str(again), str(own))
+    assert images(again) == images(joined)
+    assert "exists" in rig.hosts.run(
+        "here", "sh", "-c", f"{rig.binary} merge --hosts {again} {own} 2>&1", codes=(1,), DEPTHRIG_RUNTIME_DIR=str(rig.runtime["here"])
+    )
+    assert "[link]" not in rig.log("here")
+
+
+def test_a_cut_wire_loses_nothing(rig: Rig) -> None:
+    rig.start("here")
+    rig.start("there")
+    rig.ask("record", "start", "--name", "cut")
+    time.sleep(2)
+    rig.hosts.cut()
+    lost = rig.wait_for_host("absent", 10)
+    assert "ssh left" in lost["why"] or "does not answer" in lost["why"], lost
+    assert rig.status()["recording"]["active"]
+    time.sleep(4)
+    rig.hosts.heal()
+    rig.wait_for_host("connected", 20)
+    time.sleep(2)
+    rig.ask("record", "stop")
+    joined = rig.joined()
+    check_joined(rig, joined, rig.data("here") / "cut", [rig.data("here") / "cut_left"])
+    # The other computer recorded all the time.
+    sets = [v for topic, v, _ in messages(joined) if topic == "/mount/frame_set"]
+    both = [v for v in sets if not v.missing]
+    assert len(both) >= len(sets) - 10
+
+
+def test_a_host_that_is_killed_has_two_parts(rig: Rig) -> None:
+    rig.start("here")
+    rig.start("there")
+    rig.ask("record", "start", "--name", "killed")
+    time.sleep(3)
+    rig.kill("there")
+    rig.wait_for_host("absent", 10)
+    rig.start("there")
+    wait_for("a second part", lambda: rig.host()["recording"] == "killed_left_2")
+    time.sleep(3)
+    rig.ask("record", "stop")
+    joined = rig.joined()
+    parts = [rig.data("here") / name for name in ("killed_left", "killed_left_2")]
+    check_joined(rig, joined, rig.data("here") / "killed", parts)
+
+
+def test_a_recorder_that_is_killed_finds_its_parts_again(rig: Rig) -> None:
+    rig.start("here")
+    rig.start("there")
+    rig.ask("record", "start", "--name", "killed")
+    time.sleep(3)
+    rig.kill("here")
+    time.sleep(1)
+    assert rig.status("there")["recording"]["active"]
+    rig.start("here")
+    rig.wait_for_host("connected")
+    wait_for("the other one is stopped", lambda: not rig.status("there")["recording"]["active"])
+    joined = rig.joined()
+    check_joined(rig, joined, rig.data("here") / "killed", [rig.data("here") / "killed_left"])
+
+
+def test_a_host_that_comes_late_gets_its_part_then(rig: Rig) -> None:
+    rig.start("here")
+    said = rig.ask("record", "start", "--name", "late", codes=(3,))
+    assert "host left:" in said
+    time.sleep(2)
+    rig.start("there")
+    wait_for("its part", lambda: rig.host()["recording"] == "late_left")
+    time.sleep(3)
+    rig.ask("record", "stop")
+    check_joined(rig, rig.joined(), rig.data("here") / "late", [rig.data("here") / "late_left"])
+
+
+def test_a_copy_that_was_damaged_is_pulled_again(rig: Rig) -> None:
+    rig.start("here")
+    rig.start("there")
+    rig.ask("record", "start", "--name", "damaged")
+    copy = rig.data("here") / ".pulling" / "damaged_left" / "seg_0000.mcap.part"
+    wait_for("a copy", lambda: copy.exists() and copy.stat().st_size > 10_000)
+    with copy.open("r+b") as file:
+        file.seek(5_000)
+        file.write(b"damage")
+    rig.ask("record", "stop")
+    joined = rig.joined()
+    assert "seg_0000.mcap of damaged_left differs from its copy here" in rig.log("here")
+    check_joined(rig, joined, rig.data("here") / "damaged", [rig.data("here") / "damaged_left"])
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "why"),
+    [
+        ('rig = "mount"', 'rig = "mount2"', "not connected"),
+        ('host = "left"', 'host = "third"', 'write host = "left" into [link]'),
+        ('name = "lingbot_3"', 'name = "lingbot_0"', 'camera "lingbot_0" is a name on this computer, too'),
+    ],
+)
+def test_a_computer_that_cannot_be_part_of_the_rig_is_named_and_left_alone(
+    rig: Rig, before: str, after: str, why: str
+) -> None:
+    text = rig.rig_file("there").read_text()
+    assert before in text
+    rig.rig_file("there").write_text(text.replace(before, after))
+    rig.start("here")
+    rig.daemons["there"] = rig.hosts.start(
+        "there", rig.folder / "there.log", rig.binary, "run", str(rig.rig_file("there")),
+        DEPTHRIG_RUNTIME_DIR=str(rig.runtime["there"]), DEPTHRIG_TEST_DATA=str(DATA),
+    )  # fmt: skip
+    if "not connected" in why:
+        time.sleep(3)
+    else:
+        rig.wait_for_host("refused")
+        assert why in rig.host()["why"]
+    said = rig.ask("record", "start", "--name", "alone", codes=(3,))
+    assert "host left:" in said
+    rig.ask("record", "stop")
+    assert rig.session()["parts"] == []
+    assert not rig.data("there").exists() or not any(rig.data("there").iterdir())
