@@ -10,7 +10,7 @@ use crate::api::{
     self, BytesRequest, FileDigest, FileRequest, LoopRequest, NoteRequest, PageAddress, RateRequest,
     RecordingFiles, StepRequest,
 };
-use crate::control::{EpisodeRequest, RecordRequest, SeekRequest};
+use crate::control::{EpisodeRequest, GridRequest, GridStreams, RecordRequest, SeekRequest};
 use crate::status::{RecordingStatus, ReplayStatus, RigStatus};
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
@@ -144,6 +144,14 @@ impl Client {
     /// As [`Self::status`].
     pub fn record_status(&self) -> Result<Option<RecordingStatus>> {
         self.get("/v1/record")
+    }
+
+    /// Moves the ticks there, and returns the streams that they are chosen for.
+    ///
+    /// # Errors
+    /// As [`Self::status`] and [`crate::control::Control::follow_grid`].
+    pub fn follow_grid(&self, request: &GridRequest) -> Result<GridStreams> {
+        self.post("/v1/sets/grid", request, self.timeout())
     }
 
     /// Adds a timed note to the recording.

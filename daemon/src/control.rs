@@ -2,6 +2,7 @@
 
 use crate::doctor::Examined;
 pub use crate::losses::{LossBucket, Losses, RecordingLosses};
+use crate::sets::Rhythm;
 use crate::status::{RecordingStatus, ReplayStatus, RigStatus};
 use crate::{Error, ErrorKind, Result};
 use depthrig_bus::{RigName, RuntimeDir, UtcPair};
@@ -99,6 +100,15 @@ pub trait Control: Send + Sync {
     /// `WrongState` when none is going on.
     fn record_stop(&self) -> Result<RecordingStatus>;
 
+    /// Moves the ticks to the phase of the computer that records the session, and says which streams there are.
+    ///
+    /// # Errors
+    /// `WrongState` of a rig whose clock is that of the session, or that has no other computers.
+    fn follow_grid(&self, _: &GridRequest) -> Result<GridStreams> {
+        let what = "this rig follows the clock of no other computer ([link] with recorder in its rig file)";
+        Err(Error::new(ErrorKind::WrongState, what))
+    }
+
     /// Adds a timed note to the recording.
     ///
     /// # Errors
@@ -134,6 +144,21 @@ pub trait Control: Send + Sync {
     fn replay(&self) -> Option<&dyn ReplayControl> {
         None
     }
+}
+
+/// Where the ticks of a session of several computers lie.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GridRequest {
+    /// Nanoseconds after a whole period on the clock of the session.
+    pub phase_ns: i64,
+}
+
+/// The streams that such ticks are chosen for.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct GridStreams {
+    /// On the clock of the session; empty while that is unknown.
+    pub streams: Vec<Rhythm>,
 }
 
 fn no_controls() -> Error {

@@ -22,8 +22,9 @@ mod visit;
 
 use crate::client::Client;
 use crate::config::{HostConfig, Reach, RigConfig};
-use crate::control::RecordRequest;
+use crate::control::{GridRequest, RecordRequest};
 use crate::recording::reserve_bytes;
+use crate::sets::Grid;
 use crate::status::{CameraState, HostState, HostStatus, HostsStatus, JoinState, RecordingStatus, RigStatus};
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
@@ -35,7 +36,7 @@ use depthrig_recorder::{Health, SESSION_FILE, look_at};
 use session::{Session, Sessions};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Condvar, Mutex, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
 
 /// Makes one dataset of others ([`crate::joining`]).
 pub type JoinParts = fn(&[PathBuf], &Path, &RuntimeDir, &AtomicBool) -> Result<u64>;
@@ -75,6 +76,7 @@ pub struct Hosts {
     /// Room that pulled parts leave on the disk.
     reserve_bytes: u64,
     join: Option<JoinParts>,
+    grid: Arc<Grid>,
 }
 
 #[derive(Debug)]
@@ -91,7 +93,12 @@ impl Hosts {
     ///
     /// # Errors
     /// Those of a link to a socket that cannot be made.
-    pub fn new(config: &RigConfig, runtime: &RuntimeDir, join: Option<JoinParts>) -> Result<Option<Self>> {
+    pub fn new(
+        config: &RigConfig,
+        runtime: &RuntimeDir,
+        join: Option<JoinParts>,
+        grid: Arc<Grid>,
+    ) -> Result<Option<Self>> {
         let Some(link) = config.link.as_ref().filter(|link| !link.hosts.is_empty()) else { return Ok(None) };
         for host in &link.hosts {
             let here = runtime.host_socket_path(&config.rig, &host.name);
@@ -123,6 +130,7 @@ impl Hosts {
             cameras: config.cameras.iter().map(|c| c.name.to_string()).collect(),
             reserve_bytes: reserve_bytes(&config.recording),
             join,
+            grid,
         }))
     }
 
@@ -197,6 +205,7 @@ impl Hosts {
                 }
                 _ => false,
             };
+            self.share_grid(host, &client);
             if is_new {
                 self.changed.notify_all();
             }
@@ -206,6 +215,17 @@ impl Hosts {
             }
         }
         Ok(())
+    }
+
+    /// Says where the ticks lie, and hears of the streams there.
+    fn share_grid(&self, host: &Host, client: &Client) {
+        let is_there = {
+            let seen = lock(&host.seen);
+            seen.state == HostState::Connected && seen.has_clock
+        };
+        let phase_ns = self.grid.phase_ns();
+        let heard = is_there.then(|| client.follow_grid(&GridRequest { phase_ns }).ok()).flatten();
+        self.grid.set_other(host.config.name.as_str(), heard.unwrap_or_default().streams);
     }
 
     fn tunnel(&self, host: &Host) -> Result<Option<Tunnel>> {

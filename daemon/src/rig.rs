@@ -28,7 +28,7 @@ use crate::family::Preparation;
 use crate::hosts::{Hosts, JoinParts};
 use crate::link::Link;
 use crate::recording::{Outside, Recording, Reports, recover_left};
-use crate::sets::SpreadStats;
+use crate::sets::{Grid, SpreadStats};
 use crate::stage::{Intake, Stage};
 use crate::status::{CameraState, RigStatus, SetAccount};
 use crate::wake::Wake;
@@ -160,6 +160,8 @@ pub struct Inner {
     link: Option<Arc<Link>>,
     /// The other computers, on the one that records.
     hosts: Option<Arc<Hosts>>,
+    /// Where the ticks of all computers lie.
+    grid: Arc<Grid>,
 }
 
 /// The set assembler's numbers, as `status` shows them.
@@ -205,7 +207,8 @@ impl Rig {
             bus,
         });
         let link = config.link.as_ref().map(Link::start).transpose()?.map(Arc::new);
-        let hosts = Hosts::new(&config, &options.runtime, options.join)?.map(Arc::new);
+        let grid = Arc::<Grid>::default();
+        let hosts = Hosts::new(&config, &options.runtime, options.join, Arc::clone(&grid))?.map(Arc::new);
         let late_after_ns = live_late_ns((1e9 / config.sets.rate_hz) as i64);
         let inner = Arc::new(Inner {
             cameras: config.cameras.iter().map(|c| Arc::new(Camera::new(c.clone()))).collect(),
@@ -234,6 +237,7 @@ impl Rig {
             held_sets: AtomicUsize::new(0),
             link,
             hosts,
+            grid,
         });
         let assembly = Assembly::new(Arc::clone(&inner))?;
         let signals = signals::Collector::new(Arc::clone(&inner))?;

@@ -18,11 +18,14 @@
 //! `pushed = used + decimated + late + out_of_order + overflow + pending`.
 
 mod assembler;
+mod grid;
 mod phase;
 mod stats;
 mod stream;
 
 pub use assembler::Assembler;
+pub use grid::Grid;
+pub use phase::Rhythm;
 pub use stats::SpreadStats;
 
 use depthrig_bus::HostTime;

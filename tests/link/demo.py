@@ -148,7 +148,10 @@ def session(hosts: TwoHosts, options: argparse.Namespace, folder: Path, runtime:
     findings = json.loads(right.ask("verify", "--json", str(right.data / "demo_joined"), codes=(0, 1, 3)))["findings"]
     for finding in findings:
         print(f"  {finding['severity']}: {finding['message']}")
-    print(right.ask("replay", "--rig", "again", str(right.data / "demo_joined"), "--as-fast-as-possible", "-q"), end="")
+    # Beside the running rig, whose signals have the same names.
+    apart = runtime / "replay"
+    apart.mkdir(mode=0o700)
+    print(right.ask("replay", str(right.data / "demo_joined"), "--as-fast-as-possible", "-q", "--runtime-dir", str(apart)), end="")
     frames = {name: sum(stream["frames"] for stream in of["streams"]) for name, of in info.items()}
     if frames["demo"] + frames["demo_left"] != frames["demo_joined"]:
         print("frames are missing in the joined dataset", file=sys.stderr)

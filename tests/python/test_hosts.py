@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 from test_daemon import CAMERAS, DATA, ROOT, WAIT_S, binary  # noqa: F401
+from test_link_clock import SHIFT_NS
 from test_two_hosts import messages
 
 sys.path.insert(0, str(ROOT / "tests/link"))
@@ -119,7 +120,7 @@ def rig(binary: str, tmp_path: Path) -> Iterator[Rig]:  # noqa: F811
     # The server's user is another one where the tests run as root.
     for folder in (tmp_path, runtime):
         os.chmod(folder, 0o700)
-    with TwoHosts(tmp_path, "--shift", "1234567890123") as hosts:
+    with TwoHosts(tmp_path, "--shift", str(SHIFT_NS)) as hosts:
         yield Rig(hosts, binary, tmp_path, runtime)
 
 
@@ -174,6 +175,10 @@ def test_one_start_records_both_and_their_parts_become_one_dataset(rig: Rig) -> 
     assert [e["task"] for e in session["episodes"]] == ["pour"]
     full = [v for topic, v, _ in messages(joined) if topic == "/mount/frame_set" and not v.missing]
     assert len(full) >= 15
+    # Ticks of both lie on one grid, where the recorder put it for the cameras of both.
+    ticks = {path: [v.tick_ns for topic, v, _ in messages(path) if topic == "/mount/frame_set"] for path in (own, part)}
+    nearest = [min(abs(t - SHIFT_NS - other) for other in ticks[own]) for t in ticks[part][1:-1]]
+    assert max(nearest) < 5_000_000, nearest
     # By hand the same comes out again, and nothing that exists is overwritten.
     again = rig.folder / "again"
     rig.ask("merge", "--hosts", str(again), str(own))

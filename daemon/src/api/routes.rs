@@ -11,7 +11,7 @@ use super::requests::{
 use super::{SERVER_HEADER, allowed, guard, limits, live};
 use crate::control::{
     CalibratedImage, CameraControls, Control, ControlChanges, ControlList, ControlRequest, EpisodeRequest,
-    RecordRequest, RecordingEpisodes, ReplayControl, SeekRequest, StopRequest,
+    GridRequest, GridStreams, RecordRequest, RecordingEpisodes, ReplayControl, SeekRequest, StopRequest,
 };
 use crate::doctor::Examined;
 use crate::losses::RecordingLosses;
@@ -53,7 +53,7 @@ pub struct Route {
 const CALIBRATION_EVENTS: &str = "/v1/calibration/events";
 
 /// Every call of the API.
-pub const ROUTES: [Route; 38] = [
+pub const ROUTES: [Route; 39] = [
     Route { method: "GET", path: "/v1/status", handler: || get(status) },
     Route { method: "GET", path: "/v1/health", handler: || get(health) },
     Route { method: "GET", path: "/v1/config", handler: || get(config) },
@@ -62,6 +62,7 @@ pub const ROUTES: [Route; 38] = [
     Route { method: "POST", path: "/v1/record/start", handler: || post(record_start) },
     Route { method: "POST", path: "/v1/record/stop", handler: || post(record_stop) },
     Route { method: "POST", path: "/v1/record/note", handler: || post(record_note) },
+    Route { method: "POST", path: "/v1/sets/grid", handler: || post(sets_grid) },
     Route { method: "POST", path: "/v1/episode", handler: || post(episode) },
     Route { method: "GET", path: "/v1/episodes", handler: || get(episodes) },
     Route { method: "GET", path: "/v1/recordings", handler: || get(recordings_list) },
@@ -284,6 +285,11 @@ async fn record_note(State(rig): State<Rig>, body: Bytes) -> Answer<StatusCode> 
     let note: NoteRequest = parse(&body)?;
     call(rig, move |rig| rig.record_note(&note.text)).await?;
     Ok(StatusCode::NO_CONTENT)
+}
+
+async fn sets_grid(State(rig): State<Rig>, body: Bytes) -> Answer<Json<GridStreams>> {
+    let request: GridRequest = parse(&body)?;
+    call(rig, move |rig| rig.follow_grid(&request)).await.map(Json)
 }
 
 async fn episode(State(rig): State<Rig>, body: Bytes) -> Answer<Json<Episode>> {

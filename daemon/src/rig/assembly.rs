@@ -7,7 +7,7 @@ use super::join::{Held, LateStreams};
 use super::motion::Units;
 use crate::camera::Camera;
 use crate::config::{LinkConfig, LinkRole, Phase};
-use crate::sets::{Assembler, AssemblerConfig, FrameSet, PhasePolicy};
+use crate::sets::{Assembler, AssemblerConfig, FrameSet, PhasePolicy, Rhythm};
 use crate::status::{CameraState, SetAccount};
 use crate::stream::Stream;
 use core::time::Duration;
@@ -47,6 +47,8 @@ pub struct Assembly {
     incomplete: u64,
     /// Of the session's clock, when the ticks were last aligned.
     epoch: Option<u32>,
+    /// That the ticks were last aligned to.
+    phase_ns: i64,
 }
 
 impl Assembly {
@@ -67,6 +69,7 @@ impl Assembly {
             next_id: 1,
             incomplete: 0,
             epoch: None,
+            phase_ns: 0,
         })
     }
 
@@ -149,8 +152,10 @@ impl Assembly {
         }
         config.phase = match (&self.inner.config.link, sets.phase) {
             (Some(LinkConfig { role: LinkRole::Camera(_), .. }), _) => PhasePolicy::Aligned,
-            (Some(_), _) | (None, Phase::Fixed) => PhasePolicy::Fixed,
-            (None, Phase::Auto) => PhasePolicy::MinimiseSpread,
+            // Without [[link.hosts]] nobody says a phase to the others.
+            (Some(link), _) if link.hosts.is_empty() => PhasePolicy::Fixed,
+            (_, Phase::Fixed) => PhasePolicy::Fixed,
+            (_, Phase::Auto) => PhasePolicy::MinimiseSpread,
         };
         self.epoch = None;
         self.assembler = Some(Assembler::new(config));
@@ -193,10 +198,26 @@ impl Assembly {
 
     /// Puts the ticks on the grid of the session's clock.
     fn align(&mut self, now: HostTime) {
+        let period_ns = self.period_ns();
         let Some(assembler) = &mut self.assembler else { return };
+        let grid = &self.inner.grid;
+        if self.inner.hosts.is_some() {
+            assembler.set_far(grid.others());
+            if let Some(tick) = assembler.tick() {
+                grid.set_phase_ns(tick.ns().rem_euclid(period_ns));
+            }
+        }
         if let Some(clock) = self.inner.link.as_ref().and_then(|link| link.at(now)) {
+            let phase_ns = grid.phase_ns();
+            let moved_ns = phase_ns.saturating_sub(self.phase_ns).rem_euclid(period_ns);
+            // The other computer chose its phase anew, which it does at its start alone; later it moves by 1 % of a period.
+            let jumped = moved_ns.min(period_ns - moved_ns) > period_ns / 40;
+            self.phase_ns = phase_ns;
             let stepped = self.epoch.replace(clock.epoch) != Some(clock.epoch);
-            assembler.align(clock.offset_ns, stepped);
+            assembler.align(clock.offset_ns.saturating_sub(phase_ns), stepped || jumped);
+            let on_session =
+                |r: Rhythm| Rhythm { newest_ns: r.newest_ns.saturating_add(clock.offset_ns), ..r };
+            grid.set_own(assembler.rhythms().map(on_session));
         }
     }
 

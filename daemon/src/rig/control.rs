@@ -1,16 +1,17 @@
 //! A rig of cameras as the control API sees it.
 
 use super::{Inner, controls, lock, report};
-use crate::Result;
 use crate::attached::System;
+use crate::config::{LinkConfig, LinkRole};
 use crate::control::{
     CalibratedImage, CameraControls, Control, ControlChanges, ControlList, ControlRequest, EpisodeRequest,
-    LiveRig, RecordRequest, RecordingEpisodes, Shows,
+    GridRequest, GridStreams, LiveRig, RecordRequest, RecordingEpisodes, Shows,
 };
 use crate::doctor::{self, Surroundings};
 use crate::losses::RecordingLosses;
 use crate::recording::{self, Begun};
 use crate::status::{RecordingStatus, RigStatus};
+use crate::{Error, ErrorKind, Result};
 use core::sync::atomic::Ordering;
 use depthrig_recorder::Episode;
 use depthrig_usb::SysRoot;
@@ -106,6 +107,16 @@ impl Control for Inner {
             hosts.wait_ended();
         }
         Ok(status)
+    }
+
+    fn follow_grid(&self, request: &GridRequest) -> Result<GridStreams> {
+        if !matches!(&self.config.link, Some(LinkConfig { role: LinkRole::Camera(_), .. })) {
+            let what =
+                "this rig follows the clock of no other computer ([link] with recorder in its rig file)";
+            return Err(Error::new(ErrorKind::WrongState, what));
+        }
+        self.grid.set_phase_ns(request.phase_ns);
+        Ok(GridStreams { streams: self.grid.own() })
     }
 
     fn record_note(&self, text: &str) -> Result<()> {

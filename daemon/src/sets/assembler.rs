@@ -33,6 +33,8 @@ pub struct Assembler<T> {
     owed: i64,
     /// The other host's clock minus this one.
     offset: i64,
+    /// Streams of other hosts, for which the ticks are chosen as well.
+    far: Vec<Rhythm>,
 }
 
 impl<T> Assembler<T> {
@@ -54,6 +56,7 @@ impl<T> Assembler<T> {
             settled: config.phase != PhasePolicy::MinimiseSpread,
             owed: 0,
             offset: 0,
+            far: Vec::new(),
             config,
         }
     }
@@ -63,6 +66,24 @@ impl<T> Assembler<T> {
     pub const fn align(&mut self, offset_ns: i64, at_once: bool) {
         self.offset = offset_ns;
         self.settled &= !at_once;
+    }
+
+    /// Has the phase be chosen for streams of other hosts, too; their stamps are on this host's clock.
+    pub fn set_far(&mut self, far: Vec<Rhythm>) {
+        self.far = far;
+    }
+
+    /// The active streams that have shown a frame, as they are expected to go on.
+    pub fn rhythms(&self) -> impl Iterator<Item = Rhythm> {
+        let rhythm = |s: &Stream<T>| {
+            Some(Rhythm { newest_ns: s.newest?, period_ns: s.period, tolerance_ns: s.tolerance })
+        };
+        self.streams.iter().filter(|s| s.active).filter_map(rhythm)
+    }
+
+    /// The tick whose set is next; `None` before the first frame.
+    pub fn tick(&self) -> Option<HostTime> {
+        self.tick.map(HostTime::from_ns)
     }
 
     /// Takes a frame of a stream. Whatever cannot be in a set any more is dropped before this returns.
@@ -197,15 +218,14 @@ impl<T> Assembler<T> {
 
     /// How far `next` is to be moved now.
     fn shift(&mut self, next: i64) -> i64 {
-        let active = || self.streams.iter().filter(|s| s.active);
-        let warm = active().all(|s| s.account.pushed >= WARM_FRAMES) || self.ticks >= WARM_TICKS;
+        let mut active = self.streams.iter().filter(|s| s.active);
+        let warm = active.all(|s| s.account.pushed >= WARM_FRAMES) || self.ticks >= WARM_TICKS;
         let limit = shift_limit(&self.config, self.settled);
         if warm && (!self.settled || self.ticks.is_multiple_of(LOOK_EVERY)) {
-            let rhythms: Vec<Rhythm> = active()
-                .filter_map(|s| Some(Rhythm { newest: s.newest?, period: s.period, tolerance: s.tolerance }))
-                .collect();
+            let rhythms: Vec<Rhythm> = self.rhythms().chain(self.far.iter().copied()).collect();
             // All phases of the slowest stream, so that the best stretch of them is seen in full.
-            let range = slowest(&self.config).min(self.config.period_ns);
+            let far = self.far.iter().map(|far| far.period_ns as i64).max().unwrap_or(0);
+            let range = slowest(&self.config).max(far).min(self.config.period_ns);
             self.owed = best_shift(next, self.config.period_ns, range, &rhythms);
             self.settled = true;
         }

@@ -5,21 +5,25 @@
 //! shifts all over the range. Of a stretch of equally good shifts the middle is taken: it is furthest from
 //! where jitter would move a frame to the other side.
 
+use serde::{Deserialize, Serialize};
+
 /// A stream as it is expected to go on.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Rhythm {
-    /// Stamp of its newest frame, nanoseconds.
-    pub newest: i64,
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Rhythm {
+    /// Capture time of its newest frame, nanoseconds.
+    pub newest_ns: i64,
     /// Time between frames, nanoseconds.
-    pub period: f64,
-    pub tolerance: i64,
+    pub period_ns: f64,
+    /// A frame may lie so far from the tick of its set, nanoseconds.
+    pub tolerance_ns: i64,
 }
 
 impl Rhythm {
     /// Where the frame nearest to `tick` will lie, relative to it.
     fn nearest(&self, tick: f64) -> f64 {
-        let since = tick - self.newest as f64;
-        (since / self.period).round() * self.period - since
+        let since = tick - self.newest_ns as f64;
+        (since / self.period_ns).round() * self.period_ns - since
     }
 }
 
@@ -73,7 +77,7 @@ fn spread(tick: f64, period: i64, streams: &[Rhythm]) -> f64 {
     let mut missing = 0.0;
     for s in streams {
         let at = s.nearest(tick);
-        if at.abs() > s.tolerance as f64 {
+        if at.abs() > s.tolerance_ns as f64 {
             missing += period as f64;
         } else {
             low = low.min(at);
@@ -88,7 +92,11 @@ mod tests {
     use super::*;
 
     fn at(ms: i64, rate: f64) -> Rhythm {
-        Rhythm { newest: ms * 1_000_000, period: 1e9 / rate, tolerance: (5e8 / rate) as i64 + 1_000_000 }
+        Rhythm {
+            newest_ns: ms * 1_000_000,
+            period_ns: 1e9 / rate,
+            tolerance_ns: (5e8 / rate) as i64 + 1_000_000,
+        }
     }
 
     #[test]

@@ -430,3 +430,37 @@ fn a_clock_that_is_known_late_or_steps_moves_the_ticks_at_once() {
     assert!(slow.windows(2).all(|w| (w[1] - w[0] - 200 * MS).abs() <= 2 * MS));
     assert_eq!(from_grid(slow.last().unwrap() + 60 * MS), 0);
 }
+
+#[test]
+fn the_phase_is_chosen_for_the_streams_of_other_hosts_too() {
+    // Two streams here at 0 and 2 ms, two far ones at 20 and 22 ms of 33.3 ms: the widest gap of all four lies between 2 and 20 ms,
+    // while that of the own two alone lies opposite 1 ms.
+    let third = 33_333_333;
+    let run = |far: bool| {
+        let config = AssemblerConfig::new(200 * MS, vec![third, third]);
+        let mut assembler: Assembler<()> = Assembler::new(config);
+        let mut last = 0;
+        for i in 0..600 {
+            let now = i * third;
+            if far {
+                let rhythm =
+                    |at: i64| Rhythm { newest_ns: now + at * MS, period_ns: 1e9 / 30.0, tolerance_ns: third };
+                assembler.set_far(vec![rhythm(20), rhythm(22)]);
+            }
+            for stream in 0..2 {
+                assembler.push(stream, HostTime::from_ns(now + stream as i64 * 2 * MS), ());
+            }
+            while let Some(set) = assembler.poll(HostTime::from_ns(now + 40 * MS)) {
+                last = set.tick.ns();
+            }
+        }
+        (last.rem_euclid(third) as f64 / 1e6, assembler.rhythms().count())
+    };
+    let (alone, count) = run(false);
+    assert_eq!(count, 2);
+    // Opposite 17.7 ms, the middle of the gap from 2 to 33.3.
+    assert!((alone - 1.0).abs() < 1.0 || (alone - 34.3).abs() < 1.0, "{alone}");
+    // Opposite 11 ms, the middle of the gap from 2 to 20.
+    let (together, _) = run(true);
+    assert!((together - 27.7).abs() < 1.0, "{together}");
+}

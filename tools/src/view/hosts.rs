@@ -35,7 +35,7 @@ fn session(session: &SessionStatus, style: Style) -> Vec<String> {
     match session.joined {
         JoinState::Waiting => {}
         JoinState::Joining => {
-            lines.push(format!("joined  {} is being written", printable::line(&session.name)))
+            lines.push(format!("joined  {} is being written", printable::line(&session.name)));
         }
         JoinState::Done => {
             let dataset = session.dataset.as_deref().unwrap_or_default();
