@@ -17,6 +17,7 @@ mod refine;
 mod served;
 #[cfg(test)]
 mod tests;
+mod ways;
 
 pub use bandwidth::{LinkLoad, wire_bits_per_s};
 pub use clock::ClockSync;

@@ -12,6 +12,7 @@ pub mod answerer;
 pub mod asker;
 pub mod corridor;
 pub mod identity;
+pub mod rates;
 mod stamped;
 pub mod tunnel;
 mod wire;

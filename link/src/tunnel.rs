@@ -15,9 +15,11 @@ use std::sync::{Arc, Mutex};
 
 /// From one look at the process to the next.
 const LOOK: Duration = Duration::from_millis(50);
-/// The shortest and longest pause before `ssh` is started again.
-const PAUSES: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(2)];
-/// A connection that lasted so long was one: the next pause is the shortest again.
+/// The pause before `ssh` is started again, for a connection that was lost, and for a host that is away for long.
+const PAUSES: [Duration; 2] = [Duration::from_millis(300), Duration::from_secs(3)];
+/// A host without a connection for so long is away.
+const AWAY: Duration = Duration::from_mins(5);
+/// A connection that lasted so long was one.
 const GOOD: Duration = Duration::from_secs(5);
 /// Bytes of its messages that are kept.
 const MAX_MESSAGE: u64 = 4096;
@@ -86,20 +88,19 @@ struct Keeping {
 
 impl Keeping {
     fn run(mut self, stop: &AtomicBool) {
-        let [shortest, longest] = PAUSES;
-        let mut pause = shortest;
+        let [lost, away] = PAUSES;
+        let mut connected = HostTime::now();
         while !stop.load(Ordering::Relaxed) {
             let begun = HostTime::now();
             let ended = self.connect(stop);
             if begun.elapsed() > GOOD {
-                pause = shortest;
+                connected = HostTime::now();
             }
             *lock(&self.why) = ended.err();
-            let until = HostTime::now().plus(pause);
+            let until = HostTime::now().plus(if connected.elapsed() > AWAY { away } else { lost });
             while !until.from_now().is_zero() && !stop.load(Ordering::Relaxed) {
                 std::thread::sleep(LOOK);
             }
-            pause = (pause * 2).min(longest);
         }
         let _ = std::fs::remove_file(&self.local);
     }
@@ -131,18 +132,7 @@ impl Keeping {
 
     /// Runs a command there; its output, or the last line of its errors.
     fn ssh(&self, options: &[&str], command: &str, stop: &AtomicBool) -> Result<String, String> {
-        let mut ssh = Command::new("ssh");
-        for option in OPTIONS {
-            ssh.args(["-o", option]);
-        }
-        ssh.args(options).args(["-T", "--", &self.destination, command]);
-        ssh.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
-        // Ctrl-C on a terminal is for this process, which has something to say to the other host before it ends.
-        ssh.process_group(0);
-        let mut child = ssh.spawn().map_err(|e| match e.kind() {
-            io::ErrorKind::NotFound => "ssh is not installed (apt install openssh-client)".to_owned(),
-            _ => format!("ssh cannot be started: {e}"),
-        })?;
+        let mut child = spawn(&self.destination, options, command)?;
         let is_done = |child: &mut Child| !matches!(child.try_wait(), Ok(None));
         while !is_done(&mut child) {
             if stop.load(Ordering::Relaxed) {
@@ -153,18 +143,40 @@ impl Keeping {
             std::thread::sleep(LOOK);
         }
         let status = child.wait().map_err(|e| format!("ssh was lost: {e}"))?;
-        let text = |pipe: Option<&mut dyn Read>| {
-            let mut text = Vec::new();
-            if let Some(pipe) = pipe {
-                let _ = pipe.take(MAX_MESSAGE).read_to_end(&mut text);
-            }
-            String::from_utf8_lossy(&text).into_owned()
-        };
-        let errors = text(child.stderr.as_mut().map(|p| p as &mut dyn Read));
         if status.success() {
-            return Ok(text(child.stdout.as_mut().map(|p| p as &mut dyn Read)));
+            return Ok(text(child.stdout.as_mut()));
         }
-        let said = errors.lines().map(str::trim).rfind(|line| !line.is_empty());
-        Err(format!("ssh {}: {}", self.destination, said.unwrap_or("the connection ended")))
+        Err(said(&self.destination, &text(child.stderr.as_mut())))
     }
+}
+
+/// Starts `command` on `destination`, with pipes to it.
+pub(crate) fn spawn(destination: &str, options: &[&str], command: &str) -> Result<Child, String> {
+    let mut ssh = Command::new("ssh");
+    for option in OPTIONS {
+        ssh.args(["-o", option]);
+    }
+    ssh.args(options).args(["-T", "--", destination, command]);
+    ssh.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    // Ctrl-C on a terminal is for this process, which has something to say to the other host before it ends.
+    ssh.process_group(0);
+    ssh.spawn().map_err(|e| match e.kind() {
+        io::ErrorKind::NotFound => "ssh is not installed (apt install openssh-client)".to_owned(),
+        _ => format!("ssh cannot be started: {e}"),
+    })
+}
+
+/// The beginning of the text that comes out of a pipe, to its end.
+pub(crate) fn text(pipe: Option<&mut impl Read>) -> String {
+    let mut text = Vec::new();
+    if let Some(pipe) = pipe {
+        let _ = pipe.take(MAX_MESSAGE).read_to_end(&mut text);
+    }
+    String::from_utf8_lossy(&text).into_owned()
+}
+
+/// The last line of what `ssh` printed.
+pub(crate) fn said(destination: &str, errors: &str) -> String {
+    let line = errors.lines().map(str::trim).rfind(|line| !line.is_empty());
+    format!("ssh {destination}: {}", line.unwrap_or("the connection ended"))
 }

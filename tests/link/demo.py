@@ -118,18 +118,21 @@ def session(hosts: TwoHosts, options: argparse.Namespace, folder: Path, runtime:
 
     print(right.ask("record", "start", "--name", "demo", "--scene", "table"), end="", flush=True)
     time.sleep((options.seconds - options.cut) / 2)
-    lost_s = back_s = 0.0
     if options.cut > 0:
         begun = time.monotonic()
         hosts.cut()
-        wait_for("the cut is seen", lambda: link()["state"] == "absent")
-        lost_s = time.monotonic() - begun
-        time.sleep(max(0.0, options.cut - lost_s))
-        begun = time.monotonic()
+        seen = "not seen"
+        while time.monotonic() < begun + options.cut:
+            if seen == "not seen" and link()["state"] == "absent":
+                seen = f"seen after {time.monotonic() - begun:.1f} s"
+            time.sleep(0.05)
         hosts.heal()
+        healed = time.monotonic()
+        # A connection that the cut has ended is missed a little later.
+        time.sleep(0.2)
         wait_for("the wire is back", lambda: link()["state"] == "connected")
-        back_s = time.monotonic() - begun
-        print(f"wire cut for {options.cut:.1f} s: seen after {lost_s:.1f} s, back {back_s:.1f} s after it was whole", flush=True)
+        back_s = time.monotonic() - healed
+        print(f"wire cut for {healed - begun:.1f} s: {seen}, back {back_s:.1f} s after it was whole", flush=True)
     time.sleep((options.seconds - options.cut) / 2)
     print(right.ask("record", "stop", codes=(0, 3)), end="", flush=True)
     begun = time.monotonic()

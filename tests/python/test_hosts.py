@@ -5,6 +5,7 @@ from __future__ import annotations
 import filecmp
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import time
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import pytest
@@ -189,6 +191,21 @@ def test_one_start_records_both_and_their_parts_become_one_dataset(rig: Rig) -> 
     assert "[link]" not in rig.log("here")
 
 
+def test_doctor_measures_the_way_before_a_session(rig: Rig) -> None:
+    def found() -> dict[str, str]:
+        report = json.loads(rig.ask("doctor", "--json", str(rig.rig_file("here")), codes=(0, 1, 2, 3)))
+        return {f["id"]: f["what"] for f in report["findings"]}
+
+    # The server may still be starting.
+    way = wait_for("a way", lambda: found().get("host_reached"))
+    rates = re.fullmatch(r"host left: (\d+) MB/s from there, (\d+) MB/s to there", str(way))
+    # The wire has 1 Gbit/s, 125 MB/s; bytes that the kernels hold are counted as sent.
+    assert rates, way
+    assert all(8 < int(rate) <= 300 for rate in rates.groups()), way
+    rig.hosts.cut()
+    assert "host left is not reached: ssh left: " in found()["host_unreachable"]
+
+
 def test_a_cut_wire_loses_nothing(rig: Rig) -> None:
     rig.start("here")
     rig.start("there")
@@ -240,6 +257,30 @@ def test_a_recorder_that_is_killed_finds_its_parts_again(rig: Rig) -> None:
     wait_for("the other one is stopped", lambda: not rig.status("there")["recording"]["active"])
     joined = rig.joined()
     check_joined(rig, joined, rig.data("here") / "killed", [rig.data("here") / "killed_left"])
+
+
+def test_kills_at_any_moment_lose_nothing_that_was_recorded(rig: Rig) -> None:
+    rig.start("here")
+    rig.start("there")
+    random = Random(23)
+    for number in range(50 if "DEPTHRIG_LONG" in os.environ else 3):
+        name = f"kill{number}"
+        rig.ask("record", "start", "--name", name, codes=(0, 3))
+        time.sleep(random.uniform(0.0, 2.0))
+        victim = random.choice(["here", "there"])
+        rig.kill(victim)
+        time.sleep(random.uniform(0.0, 1.0))
+        rig.start(victim)
+        if victim == "there":
+            wait_for("a part", lambda: rig.host()["recording"])
+            time.sleep(random.uniform(0.3, 1.0))
+            rig.ask("record", "stop", codes=(0, 3))
+        else:
+            rig.wait_for_host("connected")
+        joined = rig.joined()
+        assert joined.name == f"{name}_joined"
+        parts = [rig.data("here") / part["name"] for part in rig.session()["parts"]]
+        check_joined(rig, joined, rig.data("here") / name, parts)
 
 
 def test_a_host_that_comes_late_gets_its_part_then(rig: Rig) -> None:

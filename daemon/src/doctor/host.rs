@@ -3,7 +3,8 @@
 use super::clock::{ClockSync, clock_sync};
 use super::disk::DiskFacts;
 use super::finding::{Finding, Severity};
-use super::{CameraPlan, Surroundings, link};
+use super::ways::Way;
+use super::{CameraPlan, Surroundings, link, ways};
 use crate::config::{CameraConfig, RigConfig};
 use crate::family::Unmet;
 use crate::priority;
@@ -28,11 +29,16 @@ pub struct Host {
     pub rig_holder: Option<String>,
     /// The clock of a session of several computers, or why not; `None` for one computer.
     pub link: Option<Result<LinkStatus, String>>,
+    /// The ways to the other computers that record with this one.
+    pub ways: Vec<Way>,
     /// The disk of the recordings.
     pub disk: DiskFacts,
     /// Requirements of the cameras that it does not meet.
     pub unmet: Vec<Unmet>,
 }
+
+/// Clocks of cameras and computers are followed up to this, parts per million.
+const MAX_SLEW_PPM: f64 = 500.0;
 
 impl Host {
     /// Asks for everything. The disk is measured only when something would be recorded.
@@ -46,7 +52,9 @@ impl Host {
         let measure = around.measure_disk && recorded.any(|r| r);
         let rig_holder = around.runtime.as_ref().and_then(|r| r.holder(&config.rig));
         // The rig that runs has the address.
-        let link = config.link.as_ref().filter(|_| rig_holder.is_none()).map(link::ask);
+        let link = config.link.as_ref().filter(|_| rig_holder.is_none());
+        let ways = link.map(ways::measure).unwrap_or_default();
+        let link = link.map(link::ask);
         Self {
             root: around.root.clone(),
             link,
@@ -54,6 +62,7 @@ impl Host {
             realtime_refusal: priority::refusal(),
             clock: clock_sync(),
             rig_holder,
+            ways,
             disk: DiskFacts::gather(&config.recording.directory, reserve_bytes(&config.recording), measure),
             unmet: unmet(config),
         }
@@ -92,6 +101,16 @@ impl Host {
         }
         if let Some(link) = &self.link {
             link::check(link, findings);
+        }
+        ways::check(&self.ways, findings);
+        if let Some(ppm) = self.clock.map(|c| c.slew_ppm).filter(|ppm| ppm.abs() > MAX_SLEW_PPM) {
+            findings.push(Finding::new(
+                Severity::Warning,
+                "clock_slewed",
+                format!("a program turns this computer's clock by {ppm:+.0} ppm now, to correct it"),
+                "the clocks of cameras and of other computers are followed up to 500 ppm; beyond that times are off until it is done",
+                "wait until the clock is right: `chronyc tracking` says how far it is off; or set it at once, `chronyc makestep`",
+            ));
         }
         if self.clock.is_some_and(|c| !c.synchronised) {
             findings.push(Finding::new(

@@ -4,6 +4,7 @@
 
 use super::cameras;
 use super::plan::Planned;
+use super::ways::Way;
 use super::*;
 use crate::attached::look;
 use crate::attached::tests::{FakeAnswers, kinect_half, profile, rig_with};
@@ -11,6 +12,7 @@ use crate::attached::{Attached, UseState};
 use crate::family::{Selector, Unmet, kinect};
 use depthrig_bus::PixelFormat;
 use depthrig_driver::ErrorKind;
+use depthrig_link::rates::Rates;
 use depthrig_usb::fake::{FakeDevice, FakeTree};
 use std::path::PathBuf;
 
@@ -36,8 +38,9 @@ fn well(root: SysRoot) -> Host {
         root,
         shm_free_bytes: Some(64 << 30),
         realtime_refusal: None,
-        clock: Some(ClockSync { synchronised: true, max_error_us: 900 }),
+        clock: Some(ClockSync { synchronised: true, max_error_us: 900, slew_ppm: 12.0 }),
         link: None,
+        ways: Vec::new(),
         rig_holder: None,
         disk: DiskFacts {
             folder: PathBuf::from("/data"),
@@ -83,11 +86,16 @@ fn where_all_is_well_nothing_is_found() {
 fn every_fault_of_the_computer_has_its_finding() {
     use Severity::{Error, Info, Warning};
     type Change = fn(&mut Host);
-    let cases: [(Change, &[(&str, Severity)], &str); 12] = [
+    let cases: [(Change, &[(&str, Severity)], &str); 13] = [
+        (
+            |h| h.clock = Some(ClockSync { synchronised: true, max_error_us: 9, slew_ppm: -80_000.0 }),
+            &[("clock_slewed", Warning)],
+            "-80000 ppm",
+        ),
         (|h| h.rig_holder = Some("process 9 (rig.toml)".into()), &[("rig_running", Error)], "process 9"),
         (|h| h.realtime_refusal = Some("not permitted".into()), &[("realtime", Warning)], "rtprio"),
         (
-            |h| h.clock = Some(ClockSync { synchronised: false, max_error_us: 0 }),
+            |h| h.clock = Some(ClockSync { synchronised: false, max_error_us: 0, slew_ppm: 0.0 }),
             &[("clock_unsynchronised", Info)],
             "timedatectl",
         ),
@@ -114,6 +122,24 @@ fn every_fault_of_the_computer_has_its_finding() {
             assert!(!f.what.is_empty() && !f.why.is_empty() && !f.cure.is_empty(), "{f:?}");
         }
     }
+}
+
+#[test]
+fn ways_to_other_computers_are_judged_by_their_rate() {
+    let found = |rates| {
+        let way = Way { host: "left".parse().unwrap(), destination: "lab@left".into(), rates };
+        let report = host_report(FILES, |h| h.ways = vec![way]);
+        (ids(&report), all_text(&report.findings))
+    };
+    let mb_s =
+        |from_there: f64, to_there: f64| Ok(Rates { from_there: from_there * 1e6, to_there: to_there * 1e6 });
+    assert_eq!(found(mb_s(112.0, 110.0)).0, [("host_reached", Severity::Info)]);
+    let (slow, text) = found(mb_s(2.4, 110.0));
+    assert_eq!(slow, [("host_slow", Severity::Warning)]);
+    assert!(text.contains("host left: 2 MB/s from there, 110 MB/s to there"), "{text}");
+    let (away, text) = found(Err("ssh lab@left: Permission denied (publickey).".into()));
+    assert_eq!(away, [("host_unreachable", Severity::Error)]);
+    assert!(text.contains("Permission denied") && text.contains("ssh-copy-id lab@left"), "{text}");
 }
 
 #[test]
@@ -438,7 +464,7 @@ fn what_is_attached_and_not_named_is_told_only_to_a_rig_of_real_cameras() {
 #[test]
 fn the_worst_comes_first() {
     let report = host_report(FILES, |h| {
-        h.clock = Some(ClockSync { synchronised: false, max_error_us: 0 });
+        h.clock = Some(ClockSync { synchronised: false, max_error_us: 0, slew_ppm: 0.0 });
         h.realtime_refusal = Some("no".into());
         h.disk.free_bytes = Some(0);
     });
