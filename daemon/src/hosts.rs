@@ -223,9 +223,13 @@ impl Hosts {
             let seen = lock(&host.seen);
             seen.state == HostState::Connected && seen.has_clock
         };
+        if !is_there {
+            return;
+        }
         let phase_ns = self.grid.phase_ns();
-        let heard = is_there.then(|| client.follow_grid(&GridRequest { phase_ns }).ok()).flatten();
-        self.grid.set_other(host.config.name.as_str(), heard.unwrap_or_default().streams);
+        if let Ok(heard) = client.follow_grid(&GridRequest { phase_ns }) {
+            self.grid.set_other(host.config.name.as_str(), heard.streams);
+        }
     }
 
     fn tunnel(&self, host: &Host) -> Result<Option<Tunnel>> {

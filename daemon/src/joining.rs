@@ -42,6 +42,12 @@ pub fn join(parts: &[PathBuf], out: &Path, runtime: &RuntimeDir, stop: &AtomicBo
             "name the datasets to join, and a new folder for the result",
         ));
     };
+    // A computer that was killed in its first moment has a part without a set.
+    let parts: Vec<_> = parts.iter().filter(|part| has_sets(part)).cloned().collect();
+    if parts.is_empty() {
+        return Err(Error::new(ErrorKind::BadInput, "none of the parts has a set"));
+    }
+    let parts = parts.as_slice();
     let channels = RuntimeDir::at(&runtime.path().join(CHANNELS))?;
     let hidden = out.with_file_name(FOLDER);
     let failed = |path: &Path, e: std::io::Error| {
@@ -71,6 +77,12 @@ pub fn join(parts: &[PathBuf], out: &Path, runtime: &RuntimeDir, stop: &AtomicBo
     // Another session's result may be in it.
     let _ = fs::remove_dir(&hidden);
     checked
+}
+
+/// Whether a part has anything to join; one that cannot be read has, and its error is that of the join.
+fn has_sets(part: &Path) -> bool {
+    let info = Dataset::open(part).and_then(|dataset| dataset.info());
+    info.map_or(true, |info| info.sets > 0)
 }
 
 fn remove(folder: &Path) -> std::io::Result<()> {

@@ -54,6 +54,12 @@ impl Codec {
     pub(crate) fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|c| c.name() == name)
     }
+
+    /// Whether messages of both have one type, and so may be on one topic.
+    const fn has_type_of(self, other: Self) -> bool {
+        use Codec::{Jpeg, Mjpeg, Png, Rank, Raw};
+        matches!((self, other), (Jpeg | Mjpeg | Png, Jpeg | Mjpeg | Png) | (Rank, Rank) | (Raw, Raw))
+    }
 }
 
 /// How much CPU time an encoder may spend on a frame.
@@ -103,13 +109,15 @@ impl FrameEncoder {
     pub(crate) fn encode(&mut self, job: FrameJob<'_>, effort: Effort) -> Result<EncodedFrame> {
         let h = &job.frame.header;
         let pixels = job.frame.pixels.bytes();
-        let stored = job.frame.pixels.jpeg();
         let format = image::check_image(h, pixels.len())?;
         let pixels = &pixels[..h.payload_len as usize];
         let mut codec = Codec::of(format, &self.options);
+        let stored = job.frame.pixels.stored().and_then(|s| Some((Codec::from_name(s.codec)?, s.bytes)));
+        let stored = stored.filter(|(stored, _)| *stored != Codec::Raw && stored.has_type_of(codec));
+        codec = stored.map_or(codec, |(stored, _)| stored);
         let mut compress = codec == Codec::Raw && self.options.compression == Compression::Zstd1;
         let mut packing = CompressionType::Fast;
-        // Depth of the rank codec has a message type of its own, and a JPEG that is there already costs nothing.
+        // Depth of the rank codec has a message type of its own, and an image that is stored already costs nothing.
         if effort == Effort::Least {
             compress = false;
             packing = CompressionType::Uncompressed;
@@ -133,7 +141,7 @@ impl FrameEncoder {
             header: h,
             format,
             pixels,
-            stored,
+            stored: stored.map(|(_, bytes)| bytes),
             codec,
             packing,
             frame_id: job.frame_id,
@@ -169,7 +177,7 @@ pub(crate) struct ImageJob<'a> {
     pub(crate) format: PixelFormat,
     /// As many as the header says.
     pub(crate) pixels: &'a [u8],
-    /// The JPEG that they were decoded from, if they were.
+    /// The image of this codec that they were decoded from, if they were.
     pub(crate) stored: Option<&'a [u8]>,
     pub(crate) codec: Codec,
     /// How hard a PNG is packed.
@@ -200,6 +208,11 @@ impl ImageWriter {
         let quality = self.quality;
         let repacked = &mut self.repacked;
         let depth = &mut self.depth;
+        let again = |out: &mut Vec<u8>, stored: &[u8]| {
+            out.extend_from_slice(stored);
+            Ok(())
+        };
+        let shape = DepthShape { width: h.width, height: h.height, step: h.stride };
         match (codec, format.ros_encoding()) {
             (Codec::Raw, Some(encoding)) => {
                 image::write_image(buf, stamp, frame_id, h, encoding, pixels);
@@ -210,21 +223,18 @@ impl ImageWriter {
                 out.extend_from_slice(pixels);
                 Ok(())
             }),
-            (Codec::Jpeg, _) => image::write_compressed(buf, stamp, frame_id, "jpeg", |out| {
-                if let Some(stored) = stored {
-                    out.extend_from_slice(stored);
-                    return Ok(());
-                }
-                jpeg(out, h, format, pixels, quality, repacked)
+            (Codec::Jpeg, _) => image::write_compressed(buf, stamp, frame_id, "jpeg", |out| match stored {
+                Some(stored) => again(out, stored),
+                None => jpeg(out, h, format, pixels, quality, repacked),
             }),
-            (Codec::Png, _) => image::write_compressed(buf, stamp, frame_id, "png", |out| {
-                png(out, h, format, pixels, packing, repacked)
+            (Codec::Png, _) => image::write_compressed(buf, stamp, frame_id, "png", |out| match stored {
+                Some(stored) => again(out, stored),
+                None => png(out, h, format, pixels, packing, repacked),
             }),
             (Codec::Rank, _) => {
-                let shape = DepthShape { width: h.width, height: h.height, step: h.stride };
-                let encoder = depth.get_or_insert_default();
-                image::write_compressed_depth(buf, stamp, frame_id, shape, DEPTH_CODEC, |out| {
-                    encoder.encode(pixels, shape, out)
+                image::write_compressed_depth(buf, stamp, frame_id, shape, DEPTH_CODEC, |out| match stored {
+                    Some(stored) => again(out, stored),
+                    None => depth.get_or_insert_default().encode(pixels, shape, out),
                 })
             }
         }
@@ -303,7 +313,7 @@ fn jpeg(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::frame::Pixels;
+    use crate::frame::{Pixels, ReadPixels};
 
     /// Pixels in borrowed memory.
     struct Lent(Vec<u8>);
@@ -326,6 +336,33 @@ mod tests {
         let frame = RecordFrame { stream: 0, header, pixels };
         let job = FrameJob { frame, channel: 3, frame_id: "a_frame", log_time: 5, stamp_utc_ns: 4 };
         FrameEncoder::new(options, &Pool::new(1 << 20)).encode(job, Effort::Full)
+    }
+
+    #[test]
+    fn an_image_that_was_read_is_stored_again_as_it_is() {
+        let options = RecorderOptions { depth: DepthCodec::Rank, ..RecorderOptions::default() };
+        let again = |format: PixelFormat, codec, stored: &[u8]| {
+            let pixels = vec![9; format.frame_bytes(40, 30) as usize];
+            let read = ReadPixels { pixels, codec, stored: Some(stored.to_vec()) };
+            let done = encode(&options, format, Box::new(read)).unwrap();
+            let bytes = done.chunk.parts().concat();
+            (done.codec, bytes.windows(stored.len()).any(|window| window == stored))
+        };
+        // Images that no encoder makes: they are found in the file or were encoded anew.
+        let image: Vec<u8> = (0..200u8).map(|i| i.wrapping_mul(37)).collect();
+        for (format, codec, expected) in [
+            (PixelFormat::Rgb8, "jpeg", (Codec::Jpeg, true)),
+            // Of a recorder that was short of time.
+            (PixelFormat::Bgr8, "png", (Codec::Png, true)),
+            (PixelFormat::Z16, "rank", (Codec::Rank, true)),
+            // Its topic has messages of another type.
+            (PixelFormat::Rgb8, "rank", (Codec::Jpeg, false)),
+            (PixelFormat::Z16, "png", (Codec::Rank, false)),
+            (PixelFormat::Rgb8, "raw", (Codec::Jpeg, false)),
+            (PixelFormat::Rgb8, "of a later version", (Codec::Jpeg, false)),
+        ] {
+            assert_eq!(again(format, codec, &image), expected, "{codec}");
+        }
     }
 
     #[test]

@@ -10,9 +10,9 @@ pub trait Pixels: Send {
     /// The payload: at least `FrameHeader::payload_len` bytes.
     fn bytes(&self) -> &[u8];
 
-    /// The JPEG that these pixels were decoded from, if they were. A stream that is stored as JPEG stores this one,
-    /// because encoding a second time would lose a second time.
-    fn jpeg(&self) -> Option<&[u8]> {
+    /// The stored image that these pixels were decoded from, if they were. It is stored again as it is, if its topic has messages of its type:
+    /// encoding a second time takes time, and of a JPEG it would lose a second time.
+    fn stored(&self) -> Option<StoredImage<'_>> {
         None
     }
 
@@ -20,6 +20,37 @@ pub trait Pixels: Send {
     /// Pixels in shared memory may not, because a slow disk would keep their slots from the live feed.
     fn may_wait(&self) -> bool {
         false
+    }
+}
+
+/// An image as a dataset has it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct StoredImage<'a> {
+    /// Its codec, as `DatasetFrame::codec` names it.
+    pub codec: &'static str,
+    /// Its bytes.
+    pub bytes: &'a [u8],
+}
+
+/// Pixels that were read from a dataset, with the image that they were decoded from.
+#[derive(Debug, Clone)]
+pub struct ReadPixels {
+    /// The pixels.
+    pub pixels: Vec<u8>,
+    /// Codec of the image, as `DatasetFrame::codec` names it.
+    pub codec: &'static str,
+    /// The image; `None` of pixels that are stored as they are.
+    pub stored: Option<Vec<u8>>,
+}
+
+impl Pixels for ReadPixels {
+    fn bytes(&self) -> &[u8] {
+        &self.pixels
+    }
+
+    fn stored(&self) -> Option<StoredImage<'_>> {
+        let codec = self.codec;
+        self.stored.as_deref().map(|bytes| StoredImage { codec, bytes })
     }
 }
 

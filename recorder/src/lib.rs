@@ -65,8 +65,8 @@ pub use dataset::{
 };
 pub use error::{Error, ErrorKind, Result};
 pub use frame::{
-    IMAGE_MAX_BYTES, Pixels, PushError, RecordFrame, RecordMotion, RecordSet, RecordSignal,
-    SET_MOTION_MAX_BYTES, SET_SIGNALS_MAX_BYTES, SetDrop,
+    IMAGE_MAX_BYTES, Pixels, PushError, ReadPixels, RecordFrame, RecordMotion, RecordSet, RecordSignal,
+    SET_MOTION_MAX_BYTES, SET_SIGNALS_MAX_BYTES, SetDrop, StoredImage,
 };
 pub use live::{LiveChannel, LiveEncoder, LiveFrame, LiveSource, LiveTopics};
 pub use msgs::{Diagnostic, Level, SetCounts, StreamAccount};

@@ -11,7 +11,7 @@ use depthrig_bus::{
     Bus, DropReason, ErrorKind, FrameFlags, FrameHeader, HostTime, MemberRecord, Publisher, RuntimeDir,
     SUBSCRIBER_BUFFER, SetHeader, SetPublisher, UtcPair, shm,
 };
-use depthrig_recorder::{PixelMode, Pixels, RecordFrame, RecordMotion, RecordSet};
+use depthrig_recorder::{PixelMode, ReadPixels, RecordFrame, RecordMotion, RecordSet};
 use std::sync::Arc;
 
 /// How often a replay that has nothing to publish looks for new subscribers, who are to see the last set.
@@ -40,22 +40,6 @@ struct Output {
     stream: Arc<Stream>,
     publisher: Publisher,
     sequence: u64,
-}
-
-/// A frame's pixels, with the JPEG that they came from.
-struct Read {
-    pixels: Vec<u8>,
-    jpeg: Option<Vec<u8>>,
-}
-
-impl Pixels for Read {
-    fn bytes(&self) -> &[u8] {
-        &self.pixels
-    }
-
-    fn jpeg(&self) -> Option<&[u8]> {
-        self.jpeg.as_deref()
-    }
 }
 
 impl Player {
@@ -146,7 +130,8 @@ impl Player {
                 Ok(Some(header)) => {
                     member.sequence = Some(header.sequence);
                     member.capture_time_ns = header.capture_time_ns;
-                    let pixels = Box::new(Read { pixels: frame.pixels, jpeg: frame.jpeg });
+                    let codec = frame.codec;
+                    let pixels = Box::new(ReadPixels { pixels: frame.pixels, codec, stored: frame.stored });
                     recorded.push(RecordFrame { stream: frame.stream, header, pixels });
                 }
                 Ok(None) => return, // stopped while it waited

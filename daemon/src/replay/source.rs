@@ -233,10 +233,13 @@ impl Sources {
         }
         let only = |codecs: BTreeSet<&'static str>| codecs.first().copied().filter(|_| codecs.len() == 1);
         (
-            match only(color) {
-                Some("jpeg") => ColorCodec::Jpeg,
-                Some("png") => ColorCodec::Png,
-                _ => ColorCodec::Raw,
+            // A recorder that was short of time stored PNG in place of JPEG; on the same topic, both are stored again as they are.
+            if color.iter().any(|codec| !matches!(*codec, "jpeg" | "png")) || color.is_empty() {
+                ColorCodec::Raw
+            } else if color.contains("jpeg") {
+                ColorCodec::Jpeg
+            } else {
+                ColorCodec::Png
             },
             if only(depth) == Some("rank") { DepthCodec::Rank } else { DepthCodec::default() },
         )

@@ -202,7 +202,7 @@ impl Assembly {
         let Some(assembler) = &mut self.assembler else { return };
         let grid = &self.inner.grid;
         if self.inner.hosts.is_some() {
-            assembler.set_far(grid.others());
+            assembler.set_far(grid.others(now));
             if let Some(tick) = assembler.tick() {
                 grid.set_phase_ns(tick.ns().rem_euclid(period_ns));
             }

@@ -5,9 +5,13 @@
 
 use super::Rhythm;
 use core::sync::atomic::{AtomicI64, Ordering};
+use depthrig_bus::HostTime;
 use depthrig_bus::sync::lock;
 use std::collections::BTreeMap;
 use std::sync::Mutex;
+
+/// A stream that is 20 ppm off its measured period is a quarter of a frame of 30 Hz away after so long.
+const KNOWN_FOR_NS: i64 = 400_000_000_000;
 
 /// The phase of the ticks, and the streams that it is chosen for.
 #[derive(Debug, Default)]
@@ -43,12 +47,13 @@ impl Grid {
         own.extend(rhythms);
     }
 
-    /// Rhythms of all other computers.
-    pub fn others(&self) -> Vec<Rhythm> {
-        lock(&self.others).values().flatten().copied().collect()
+    /// Rhythms of all other computers, of those that are away too, which keep the phase: for some minutes they are known well enough.
+    pub fn others(&self, now: HostTime) -> Vec<Rhythm> {
+        let is_known = |r: &&Rhythm| now.ns().saturating_sub(r.newest_ns) < KNOWN_FOR_NS;
+        lock(&self.others).values().flatten().filter(is_known).copied().collect()
     }
 
-    /// Sets the rhythms of another computer; none when it is away.
+    /// Sets the rhythms of another computer.
     pub fn set_other(&self, host: &str, rhythms: Vec<Rhythm>) {
         lock(&self.others).insert(host.to_owned(), rhythms);
     }

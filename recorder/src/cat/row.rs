@@ -183,7 +183,7 @@ mod tests {
             codec: "raw",
             stored_bytes: 13,
             pixels: Vec::new(),
-            jpeg: None,
+            stored: None,
             filter: None,
         };
         let set = DatasetSet {

@@ -55,7 +55,7 @@ pub enum PixelMode {
     Decoded,
     /// Deliver what is stored: the JPEG, or the pixels of an image stored losslessly.
     Stored,
-    /// As `Decoded`, and where that was a JPEG, deliver it as well.
+    /// As `Decoded`, with the stored image where that is another one.
     DecodedAndStored,
     /// Deliver none; the images are not even read.
     None,
@@ -99,8 +99,8 @@ pub struct DatasetFrame {
     pub stored_bytes: u64,
     /// The payload, as [`PixelMode`] says.
     pub pixels: Vec<u8>,
-    /// The JPEG that the pixels were decoded from, with [`PixelMode::DecodedAndStored`].
-    pub jpeg: Option<Vec<u8>>,
+    /// The image that the pixels were decoded from, with [`PixelMode::DecodedAndStored`]; `None` where pixels are stored as they are.
+    pub stored: Option<Vec<u8>>,
     /// Of its dataset, for pixels that are not decoded yet.
     pub(crate) filter: Option<PixelFilter>,
 }
@@ -352,7 +352,7 @@ fn assemble(
             let what = format!("{} is stored with codec \"{}\", unknown here", member.stream, extra.codec);
             Error::new(ErrorKind::Version, what)
         })?;
-        let mut jpeg = None;
+        let mut kept = None;
         let pixels = if mode == PixelMode::None {
             Vec::new()
         } else {
@@ -362,7 +362,10 @@ fn assemble(
                 return Err(lacks(&member.stream, "right image: another one is in its place, that"));
             }
             let stored = decode::stored(&image, codec)?;
-            jpeg = (mode == PixelMode::DecodedAndStored && codec == Codec::Jpeg).then(|| stored.to_vec());
+            // Of filtered pixels it would be another image.
+            let is_kept =
+                mode == PixelMode::DecodedAndStored && codec != Codec::Raw && dataset.filter().is_none();
+            kept = is_kept.then(|| stored.to_vec());
             if mode == PixelMode::Stored {
                 stored.to_vec()
             } else {
@@ -376,7 +379,7 @@ fn assemble(
         let stored_bytes = member.message_bytes;
         let filter = dataset.filter().filter(|_| mode == PixelMode::Stored).cloned();
         let codec = codec.name();
-        frames.push(DatasetFrame { stream, header, codec, stored_bytes, pixels, jpeg, filter });
+        frames.push(DatasetFrame { stream, header, codec, stored_bytes, pixels, stored: kept, filter });
     }
     let batches = partial.batches.into_iter().filter(|b| b.log_time == log_time);
     let motion = batches.map(|b| batch(b, set.id, dataset)).collect::<Result<_>>()?;

@@ -7,7 +7,7 @@ use depthrig_bus::{DropCounts, PixelFormat, StageStep, UtcPair};
 use depthrig_cdm::stage::derived_header;
 use depthrig_recorder::codec::{DepthDecoder, DepthShape};
 use depthrig_recorder::{
-    Dataset, DatasetSet, Derived, Error, ErrorKind, PixelMode, Pixels, RecordFrame, RecordSet, Result,
+    Dataset, DatasetSet, Derived, Error, ErrorKind, PixelMode, ReadPixels, RecordFrame, RecordSet, Result,
     Session, SetReader, StreamAccount, StreamRecord,
 };
 use std::path::Path;
@@ -28,22 +28,6 @@ pub(super) struct Write<'a> {
     numbers: Vec<u64>,
     epochs: Vec<Option<u32>>,
     facts: ImportFacts,
-}
-
-/// Pixels as the recorder wants them, with the JPEG that they are of.
-struct Stored {
-    pixels: Vec<u8>,
-    jpeg: Option<Vec<u8>>,
-}
-
-impl Pixels for Stored {
-    fn bytes(&self) -> &[u8] {
-        &self.pixels
-    }
-
-    fn jpeg(&self) -> Option<&[u8]> {
-        self.jpeg.as_deref()
-    }
 }
 
 impl<'a> Write<'a> {
@@ -187,7 +171,7 @@ impl Importer for Write<'_> {
                 .frames
                 .into_iter()
                 .map(|f| {
-                    let pixels = Box::new(Stored { pixels: f.pixels, jpeg: f.jpeg });
+                    let pixels = Box::new(ReadPixels { pixels: f.pixels, codec: f.codec, stored: f.stored });
                     RecordFrame { stream: f.stream, header: f.header, pixels }
                 })
                 .collect();
