@@ -342,7 +342,7 @@ mod tests {
     fn an_image_that_was_read_is_stored_again_as_it_is() {
         let options = RecorderOptions { depth: DepthCodec::Rank, ..RecorderOptions::default() };
         let again = |format: PixelFormat, codec, stored: &[u8]| {
-            let pixels = vec![9; format.frame_bytes(40, 30) as usize];
+            let pixels = vec![9; format.frame_bytes(40, 30)];
             let read = ReadPixels { pixels, codec, stored: Some(stored.to_vec()) };
             let done = encode(&options, format, Box::new(read)).unwrap();
             let bytes = done.chunk.parts().concat();

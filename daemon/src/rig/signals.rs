@@ -95,10 +95,14 @@ impl Collector {
                 self.find();
                 next_look = HostTime::now().plus_ns(LOOK_EVERY_NS);
             }
-            for input in self.inputs.values_mut() {
-                input.read(&self.inner);
-            }
+            self.read();
             std::thread::sleep(READ_EVERY);
+        }
+    }
+
+    fn read(&mut self) {
+        for input in self.inputs.values_mut() {
+            input.read(&self.inner);
         }
     }
 
@@ -115,6 +119,8 @@ impl Collector {
                     self.unread.remove(name);
                     self.inputs
                         .insert(name.clone(), Input { id, subscriber, missed: 0, is_unreadable: false });
+                    // Opening a channel takes some milliseconds: twenty of them must not make others overflow.
+                    self.read();
                 }
                 // Its publisher is just opening the channel.
                 Err(e) if e.kind() == ErrorKind::NotFound => {}

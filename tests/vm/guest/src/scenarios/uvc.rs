@@ -112,7 +112,7 @@ impl Seen {
             }
             PixelFormat::Mjpeg => {
                 // As it came: not coded again, and not a byte taken away.
-                let jpeg = frame.jpeg.as_ref().unwrap_or(&frame.pixels);
+                let jpeg = &frame.pixels;
                 let index = Stamp::read(jpeg).context("a JPEG without its comment")?.index;
                 (&mut self.kept, *jpeg == camera.expected("color", index)?, Some(index))
             }

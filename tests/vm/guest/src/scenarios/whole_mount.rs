@@ -300,7 +300,7 @@ fn contents(
                 }
                 ("kinect", "depth") => played.add(shown.depth.contains(&frame.pixels)),
                 ("kinect", "color") => {
-                    played.add(shown.color.contains(frame.jpeg.as_ref().unwrap_or(&frame.pixels)));
+                    played.add(shown.color.contains(frame.stored.as_ref().unwrap_or(&frame.pixels)));
                 }
                 ("zed2i" | "kinect" | "other", _) => {}
                 // An L515 turns depth; its scenario compares the bytes.
