@@ -315,6 +315,32 @@ def test_the_pose_between_two_poses_turns_evenly(folder: Path) -> None:
         assert read.description.frame == "base"
 
 
+@pytest.mark.parametrize("turn", [0.001, 0.05, 0.5, 3.0])
+def test_small_and_large_turns_are_even_and_quaternions_of_any_length_are_rotations(folder: Path, turn: float) -> None:
+    pose = depthrig.Signal("arm/tool_pose", kind="pose", frame="base", runtime_dir=folder)
+    with pose, reader(folder, "arm/tool_pose") as read:
+        start = time.monotonic_ns() - 1_000_000_000
+        pose.publish([0, 0, 0, 0, 0, 0, 2.0], start)
+        pose.publish([0, 0, 0, 0.5 * math.sin(turn / 2), 0, 0, 0.5 * math.cos(turn / 2)], start + 1000)
+        for share in (0.125, 0.25, 0.75):
+            got = read.at(start + int(1000 * share), 1)["rotation_xyzw"]
+            expected = [math.sin(share * turn / 2), 0, 0, math.cos(share * turn / 2)]
+            assert got.tolist() == pytest.approx(expected, abs=1e-6 * turn)
+
+
+def test_between_two_samples_what_does_not_change_stays_and_flags_are_those_of_both(folder: Path, arm: depthrig.Signal) -> None:
+    with reader(folder) as read:
+        start = time.monotonic_ns() - 1_000_000_000
+        arm.publish([math.inf, 0.1, -math.inf], start)
+        arm.publish([math.inf, 0.1, 1.0], start + 1000, time_uncertain=True)
+        got = read.at(start + 300, 1)
+        assert got["shoulder"] == math.inf
+        assert got["elbow"] == 0.1, "to the last bit"
+        assert got["wrist"] == -math.inf
+        assert depthrig.SignalFlags.TIME_UNCERTAIN in got.flags
+        assert depthrig.SignalFlags.TIME_UNCERTAIN not in read.at(start, 1).flags
+
+
 def test_an_old_sample_is_stale(folder: Path, arm: depthrig.Signal) -> None:
     with reader(folder) as read:
         with pytest.raises(depthrig.Stale, match="no sample has come yet") as none:

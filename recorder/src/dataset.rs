@@ -11,6 +11,7 @@ mod decode;
 mod filter;
 mod index;
 mod info;
+mod removed;
 mod sets;
 mod signals;
 
@@ -22,6 +23,7 @@ pub use filter::PixelFilter;
 pub use index::SetReader;
 pub use info::{AttachedCalibration, DatasetInfo, MotionInfo, SignalInfo, SpreadStats, StreamInfo};
 pub(crate) use info::{MotionCount, image_chunks};
+pub(crate) use removed::Removed;
 pub use sets::{DatasetFrame, DatasetSet, PixelMode, SetRange, Sets};
 pub(crate) use sets::{Kind, kind_of, kinds};
 pub(crate) use signals::SignalCount;

@@ -82,8 +82,8 @@ pub use recover::{
 pub use select::{Edge, Moment, SetSpan};
 pub use session::{
     Computed, Derived, Edit, Episode, EpisodeCounts, EpisodeEnd, EpisodeOutcome, FORMAT, Mark, MotionRecord,
-    NOTE_MAX_BYTES, Note, Outcome, SESSION_FILE, Session, SessionChanges, SignalRecord, StreamCalibration,
-    StreamRecord, UnitCalibration, adopt, check_name, edit, rename,
+    NOTE_MAX_BYTES, Note, Outcome, RemovedSets, SESSION_FILE, Session, SessionChanges, SignalRecord,
+    StreamCalibration, StreamRecord, UnitCalibration, adopt, check_name, edit, rename,
 };
 pub use slice::{SliceOptions, SliceProgress, SliceReport, merge, trim};
 pub use still::{StillFormat, still};

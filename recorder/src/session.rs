@@ -214,6 +214,18 @@ pub struct Derived {
     /// Sets that were offered to the recorder before its own begin: `FrameSet.sets_offered` counts these as well.
     #[serde(default)]
     pub offered_before: u64,
+    /// Runs of sets that `prune` removed between others.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub removed: Vec<RemovedSets>,
+}
+
+/// Consecutive sets that were removed from a dataset.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RemovedSets {
+    /// Log time of the first one, UTC nanoseconds since 1970.
+    pub first_utc_ns: i64,
+    /// Log time of the last one.
+    pub last_utc_ns: i64,
 }
 
 /// A note of the operator.

@@ -12,7 +12,7 @@ use crate::dataset::Dataset;
 use crate::fs::Fs;
 use crate::recorder::topics::SESSION_METADATA;
 use crate::select::SetSpan;
-use crate::{Derived, Error, ErrorKind, RecorderOptions, Result, Session};
+use crate::{Derived, Error, ErrorKind, RecorderOptions, RemovedSets, Result, Session};
 use depthrig_bus::UtcPair;
 use serde::Serialize;
 use std::ops::ControlFlow;
@@ -150,12 +150,17 @@ pub(crate) fn without_discarded(
 ) -> Result<SliceReport> {
     let inputs = [Input::new(dataset)];
     let pieces = (0..dataset.segments().len()).map(|segment| Piece { input: 0, segment }).collect();
-    let mut kept = dataset.set_reader()?.times().to_vec();
-    kept.retain(|utc_ns| !dataset.session().is_discarded(*utc_ns));
+    let times = dataset.set_reader()?.times().to_vec();
+    let is_removed = |utc_ns: &i64| dataset.session().is_discarded(*utc_ns);
+    let kept: Vec<i64> = times.iter().copied().filter(|utc_ns| !is_removed(utc_ns)).collect();
     let first_utc_ns = kept.first().copied().unwrap_or_default();
     let last_utc_ns = kept.last().copied().unwrap_or_default();
     session.outcome = None;
-    session.derived.push(derived("prune", &inputs, first_utc_ns, last_utc_ns));
+    let runs = times.chunk_by(|a, b| is_removed(a) == is_removed(b)).filter(|run| run.iter().all(is_removed));
+    let removed =
+        runs.filter_map(|run| Some(RemovedSets { first_utc_ns: *run.first()?, last_utc_ns: *run.last()? }));
+    let step = derived("prune", &inputs, first_utc_ns, last_utc_ns);
+    session.derived.push(Derived { removed: removed.collect(), ..step });
     let range = track::Range { prunes: true, ..track::Range::ALL };
     Join::new(&inputs, range, SliceOptions::default()).run(fs, &[pieces], session, out, progress)
 }
@@ -174,6 +179,7 @@ fn derived(by: &str, inputs: &[Input<'_>], first_utc_ns: i64, last_utc_ns: i64) 
         last_utc_ns,
         // Known with the first set.
         offered_before: 0,
+        removed: Vec::new(),
     }
 }
 

@@ -283,6 +283,40 @@ def test_hdf5_has_every_image_and_value(binary: str, runtime: Path, recovered: P
     assert stream["intrinsics"]["fx"] > 100 and stream["pose_on_mount"]
 
 
+def test_hdf5_marks_missing_images_and_the_others_are_in_their_rows(binary: str, runtime: Path, tmp_path: Path) -> None:  # noqa: F811
+    rig, data = tmp_path / "rig.toml", tmp_path / "data"
+    # Two of three sets have no depth.
+    text = RIG.replace("rate_hz = 5.0", "rate_hz = 15.0").replace("[[camera.stream]]", "cheap = true\n[[camera.stream]]", 1)
+    begin, end = text.rsplit("rate_hz = 15.0", 1)
+    rig.write_text(f"{begin}rate_hz = 6.0{end}")
+    with running(binary, runtime, tmp_path / "log", "run", str(rig), "--record", str(data), "--force", codes=(0, 3)):
+        deadline = time.monotonic() + WAIT_S
+        while not list(data.rglob("session.toml")):
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        wait_for_sets(depthrig.Recording("cell", runtime), 30)
+    (dataset,) = data.iterdir()
+    sets = []
+    for segment in sorted(dataset.glob("seg_*.mcap")):
+        with segment.open("rb") as file:
+            reader = make_reader(file, decoder_factories=[DecoderFactory()])
+            sets += [(m.log_time, d) for _, _, m, d in reader.iter_decoded_messages(topics=["/cell/frame_set"])]
+    depth = images(dataset, "/cell/top/depth/image_raw")
+    command(binary, runtime, "export", "hdf5", str(dataset), str(tmp_path / "out"), codes=(0, 3))
+    with h5py.File(tmp_path / "out" / "demo.hdf5") as file:
+        demo = file["data/demo_0"]
+        assert list(demo["utc_ns"]) == [time_ns for time_ns, _ in sets]
+        assert "mask" not in file and "success" not in demo.attrs, "nobody judged it"
+        missing = ["top/depth" in decoded.missing for _, decoded in sets]
+        assert any(missing) and not all(missing)
+        assert list(demo["missing/top_depth"]) == missing
+        for row, (_, decoded) in enumerate(sets):
+            taken = [m.capture_time_ns + decoded.utc_offset_ns for m in decoded.members if m.stream == "top/depth"]
+            assert demo["capture_utc_ns/top_depth"][row] == sum(taken)
+            expected = depth[taken[0]] if taken else np.zeros((480, 640, 1), np.uint16)
+            np.testing.assert_array_equal(demo["obs/top_depth"][row], expected)
+
+
 def test_robomimic_loads_hdf5(binary: str, runtime: Path, recovered: Path, tmp_path: Path) -> None:  # noqa: F811
     if not LOADER.exists():
         pytest.skip("the package robomimic is not installed (make test does it)")

@@ -18,6 +18,7 @@ import subprocess
 import sys
 import threading
 import time
+import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -224,6 +225,13 @@ def wait_until_known(robot: Robot) -> None:
     while len(robot.sent.get("gripper/state", [])) < 100:
         assert time.monotonic() < deadline
         time.sleep(0.05)
+
+
+def wait_until_running(binary: str, runtime: Path) -> None:  # noqa: F811
+    deadline = time.monotonic() + WAIT_S
+    while subprocess.run([binary, "status"], env=environment(runtime), capture_output=True, check=False).returncode != 0:
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
 
 
 def check_all(recorded: Recorded, signal: str, got: list[tuple[int, list[Any]]]) -> None:
@@ -436,6 +444,9 @@ def test_ten_kilohertz_are_recorded_and_what_a_stopped_daemon_misses_is_counted(
     assert sum(gaps) > 0
     said = json.loads(command(binary, runtime, "info", "--json", str(dataset)))["signals"]
     assert [s["lost"] for s in said if s["signal"] == "fast/joints"] == [sum(gaps)]
+    accounts = [a for c, _, v in decoded(dataset) if c.topic == "/images/accounts" for a in v.streams]
+    account = [a for a in accounts if a.stream == "fast/joints"][-1]
+    assert (account.delivered, sum(account.dropped)) == (len(numbers), sum(gaps))
 
 
 def test_a_publisher_with_other_fields_is_refused_by_name(binary: str, runtime: Path, rig: tuple[Path, Path]) -> None:  # noqa: F811
@@ -456,6 +467,69 @@ def test_a_publisher_with_other_fields_is_refused_by_name(binary: str, runtime: 
     assert lengths == {2}
 
 
+def test_a_recording_begins_with_the_second_before_and_the_last_sample_however_old(
+    binary: str,  # noqa: F811
+    runtime: Path,  # noqa: F811
+    rig: tuple[Path, Path],
+) -> None:
+    path, folder = rig
+
+    def heard(name: str) -> int:
+        said = json.loads(command(binary, runtime, "status", "--json", codes=(0, 3)))["signals"]
+        return sum(s["samples"] for s in said if s["signal"] == name)
+
+    with (
+        running(binary, runtime, folder / "before.log", "run", str(path), codes=(0, 3)),
+        depthrig.Signal("slow/mode", ["mode"], runtime_dir=runtime) as slow,
+        publisher(runtime, "fast/before", "a,b", 100),
+    ):
+        wait_until_running(binary, runtime)
+        deadline = time.monotonic() + WAIT_S
+        for number in range(1, 4):
+            slow.publish([number])
+            while heard("slow/mode") < number or heard("fast/before") < 100 * number:
+                assert time.monotonic() < deadline
+                time.sleep(0.1)
+        time.sleep(1.5)
+        dataset = record(binary, runtime, folder, "before")
+        wait_for_sets(binary, runtime, 3)
+        command(binary, runtime, "record", "stop", codes=(0, 3))
+    values, fast, first_set = [], [], 0
+    for channel, message, value in decoded(dataset):
+        if channel.topic == "/images/frame_set":
+            first_set = first_set or message.log_time
+        if channel.topic == "/images/slow/mode/values":
+            values.append(value.fields[0].floats[0])
+        if channel.topic == "/images/fast/before/joint_states":
+            fast.append(message.publish_time)
+    assert values == [3]
+    # The first set has its moment some images after the recording began.
+    before_s = (first_set - fast[0]) / 1e9
+    assert 0.05 < before_s < 1.9, "one second, and the time until the first set"
+    assert len(fast) > 50
+
+
+def test_a_signal_with_the_name_of_a_stream_is_refused_once_and_costs_nothing(
+    binary: str,  # noqa: F811
+    runtime: Path,  # noqa: F811
+    rig: tuple[Path, Path],
+) -> None:
+    path, folder = rig
+    log = folder / "clash.log"
+    with running(binary, runtime, log, "run", str(path), codes=(0, 3)):
+        wait_until_running(binary, runtime)
+        dataset = record(binary, runtime, folder, "clash")
+        stream = tomllib.loads((dataset / "session.toml").read_text())["streams"][0]["id"]
+        with publisher(runtime, stream, "a,b", 100), publisher(runtime, "beside/it", "a,b", 100):
+            wait_for_sets(binary, runtime, 6)
+        command(binary, runtime, "record", "stop", codes=(0, 3))
+    why = f"signal {stream} is not recorded: a stream of a camera has the same name"
+    assert log.read_text().count(why) == 1
+    report = json.loads(command(binary, runtime, "verify", "--decode", "--json", str(dataset), codes=(0, 3)))
+    assert [f["message"] for f in report["findings"] if f["severity"] != "note"] == []
+    assert {s["signal"] for s in json.loads(command(binary, runtime, "info", "--json", str(dataset)))["signals"]} == {"beside/it"}
+
+
 def test_a_killed_recorder_loses_a_second_at_most(binary: str, runtime: Path, rig: tuple[Path, Path]) -> None:  # noqa: F811
     path, folder = rig
     with publishing(runtime) as robot:
@@ -463,10 +537,7 @@ def test_a_killed_recorder_loses_a_second_at_most(binary: str, runtime: Path, ri
             process = subprocess.Popen([binary, "run", str(path)], env=environment(runtime), stdout=out, stderr=out)
         try:
             wait_until_known(robot)
-            deadline = time.monotonic() + WAIT_S
-            while "images" not in depthrig.running_rigs(runtime):
-                assert time.monotonic() < deadline
-                time.sleep(0.1)
+            wait_until_running(binary, runtime)
             dataset = record(binary, runtime, folder, "killed")
             wait_for_sets(binary, runtime, 12)
         finally:
@@ -500,7 +571,8 @@ def test_a_required_signal_must_come_before_a_recording_begins(
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "required.toml"
-    path.write_text(rig[0].read_text() + '\n[[signal]]\nname = "late/joints"\nrequired = true\nsilent_s = 0.5\n')
+    listed = '[[signal]]\nname = "late/joints"\nrequired = true\nsilent_s = 0.5\n[[signal]]\nname = "never/there"\n'
+    path.write_text(f"{rig[0].read_text()}\n{listed}")
 
     def the_signal(code: int) -> dict[str, Any]:
         deadline = time.monotonic() + WAIT_S
@@ -508,7 +580,8 @@ def test_a_required_signal_must_come_before_a_recording_begins(
             call = [binary, "status", "--json"]
             done = subprocess.run(call, env=environment(runtime), capture_output=True, text=True, check=False)
             if done.returncode == code:
-                (signal,) = json.loads(done.stdout)["signals"]
+                signal, other = json.loads(done.stdout)["signals"]
+                assert (other["signal"], other["required"], other["state"]) == ("never/there", False, "missing")
                 return dict(signal)
             assert time.monotonic() < deadline, done.stdout + done.stderr
             time.sleep(0.1)

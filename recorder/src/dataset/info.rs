@@ -1,5 +1,6 @@
 //! Content of a dataset, without reading an image.
 
+use super::removed::{Crossing, Removed};
 use super::{Dataset, PixelMode, SetRange, SignalCount};
 use crate::container::scan::{ChunkEntry, SegmentReader};
 use crate::msgs::accounts;
@@ -195,7 +196,7 @@ pub struct SignalInfo {
 pub(crate) struct MotionCount {
     /// Batches that passed.
     pub(crate) batches: u64,
-    /// Batches that are missing between those.
+    /// Batches that are missing between those, without those of removed sets.
     pub(crate) lost_batches: u64,
     /// Samples that passed.
     pub(crate) samples: u64,
@@ -204,16 +205,22 @@ pub(crate) struct MotionCount {
     last_batch: Option<(u64, [u64; 8])>,
     last_sample: Option<u64>,
     times: Option<(i64, i64)>,
+    crossing: Crossing,
 }
 
 impl MotionCount {
-    pub(crate) fn take(&mut self, batch: &RecordMotion) {
+    /// Takes a batch of a set by the set's log time.
+    pub(crate) fn take(&mut self, batch: &RecordMotion, set_utc_ns: i64, removed: &Removed) {
+        let crosses = self.crossing.take(set_utc_ns, removed);
         let sequence = batch.header.sequence;
         let skipped = self.last_batch.map_or(0, |(last, _)| sequence.saturating_sub(last.saturating_add(1)));
-        self.lost_batches = self.lost_batches.saturating_add(skipped);
+        if !crosses {
+            self.lost_batches = self.lost_batches.saturating_add(skipped);
+        }
         // A recorded replay may begin again at any batch.
         let replayed = batch.header.flags & FrameFlags::REPLAYED.0 != 0;
         let mut kept = skipped == 0
+            && !crosses
             && !replayed
             && self.last_batch.is_none_or(|(_, dropped)| dropped == batch.header.dropped);
         self.last_batch = Some((sequence, batch.header.dropped));
@@ -227,7 +234,10 @@ impl MotionCount {
         self.batches += 1;
         self.samples += batch.samples.len() as u64;
         if let (Some(first), Some(last)) = (batch.samples.first(), batch.samples.last()) {
-            let (began, _) = self.times.unwrap_or((first.time_ns, 0));
+            let (began, before) = self.times.unwrap_or((first.time_ns, 0));
+            if crosses {
+                self.crossing.pass(before, first.time_ns);
+            }
             self.times = Some((began, last.time_ns));
         }
     }
@@ -235,7 +245,7 @@ impl MotionCount {
     /// Samples per second, 0 without two.
     pub(crate) fn rate_hz(&self) -> f64 {
         let span = self.times.map_or(0, |(first, last)| last.saturating_sub(first));
-        if span > 0 { self.samples.saturating_sub(1) as f64 * 1e9 / span as f64 } else { 0.0 }
+        self.crossing.rate_hz(self.samples, span)
     }
 }
 
@@ -327,6 +337,7 @@ pub(super) fn gather(dataset: &Dataset) -> Result<DatasetInfo> {
     let mut ticks = None;
     let mut units = vec![MotionCount::default(); session.motion.len()];
     let mut signals = vec![SignalCount::default(); session.signals.len()];
+    let removed = Removed::of(session);
     let mut captures = vec![None; info.streams.len()];
     for set in dataset.sets_with(SetRange::ALL, PixelMode::None) {
         let set = match set {
@@ -343,10 +354,10 @@ pub(super) fn gather(dataset: &Dataset) -> Result<DatasetInfo> {
         let (first, _) = ticks.unwrap_or((set.tick, set.tick));
         ticks = Some((first, set.tick));
         for batch in &set.motion {
-            units[batch.unit].take(batch);
+            units[batch.unit].take(batch, set.utc_ns, &removed);
         }
         for part in &set.signals {
-            signals[part.signal].take(&part.samples);
+            signals[part.signal].take(&part.samples, set.utc_ns, &removed);
         }
         for s in set.missing {
             info.streams[s].missing += 1;

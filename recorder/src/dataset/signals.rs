@@ -1,5 +1,6 @@
 //! Counts of a signal while its samples are read.
 
+use super::removed::{Crossing, Removed};
 use depthrig_bus::{SignalSample, StreamId};
 
 /// Silence at the end of a recording is stated if it is longer than this and ten times the usual distance of samples.
@@ -10,12 +11,13 @@ const SILENT_NS: i64 = 1_000_000_000;
 pub(crate) struct SignalCount {
     /// Samples that passed.
     pub(crate) samples: u64,
-    /// Samples that are missing between those.
+    /// Samples that are missing between those, without those of removed sets.
     pub(crate) lost: u64,
     /// Number of times that another publisher took over.
     pub(crate) restarts: u64,
     /// Time without a publisher's samples at these.
     away_ns: i64,
+    crossing: Crossing,
     first_ns: Option<i64>,
     last: Option<Last>,
 }
@@ -28,14 +30,18 @@ struct Last {
 }
 
 impl SignalCount {
-    pub(crate) fn take(&mut self, samples: &[SignalSample]) {
+    /// Takes the samples of a set by its log time.
+    pub(crate) fn take(&mut self, samples: &[SignalSample], set_utc_ns: i64, removed: &Removed) {
+        let mut crosses = self.crossing.take(set_utc_ns, removed);
         for sample in samples {
             let h = sample.header();
             self.samples += 1;
             self.first_ns.get_or_insert(h.time_ns);
             let now = Last { session: h.session, sequence: h.sequence, time_ns: h.time_ns };
             let Some(before) = self.last.replace(now) else { continue };
-            if before.session == now.session {
+            if std::mem::take(&mut crosses) {
+                self.crossing.pass(before.time_ns, now.time_ns);
+            } else if before.session == now.session {
                 let gap = now.sequence.saturating_sub(before.sequence.saturating_add(1));
                 self.lost = self.lost.saturating_add(gap);
             } else {
@@ -49,8 +55,7 @@ impl SignalCount {
 
     /// Samples per second, 0 without two.
     pub(crate) fn rate_hz(&self) -> f64 {
-        let span = self.span_ns();
-        if span > 0 { self.samples.saturating_sub(1) as f64 * 1e9 / span as f64 } else { 0.0 }
+        self.crossing.rate_hz(self.samples, self.span_ns())
     }
 
     fn span_ns(&self) -> i64 {
@@ -70,7 +75,8 @@ impl SignalCount {
                 self.away_ns as f64 / 1e9
             ));
         }
-        let period_ns = self.span_ns() / i64::try_from(self.samples.saturating_sub(1).max(1)).unwrap_or(1);
+        let span_ns = self.span_ns().saturating_sub(self.crossing.away_ns);
+        let period_ns = span_ns / i64::try_from(self.samples.saturating_sub(1).max(1)).unwrap_or(1);
         match (self.last, end_ns) {
             (None, _) => words.push(format!("{id} has no samples")),
             (Some(last), Some(end)) => {

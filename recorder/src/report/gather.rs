@@ -6,7 +6,7 @@ use super::{
     SetsAccount, SetsReport, StreamReport, verdict,
 };
 use crate::catalog::look_at;
-use crate::dataset::{Dataset, DatasetSet, PixelMode, SetRange};
+use crate::dataset::{Dataset, DatasetSet, PixelMode, Removed, SetRange};
 use crate::{ErrorKind, Result, StreamAccount};
 use depthrig_bus::{FrameFlags, FrameHeader};
 use images::SampledImages;
@@ -170,6 +170,7 @@ struct Pass {
     /// Log time of the first set.
     t0_ns: i64,
     streams: Vec<Stream>,
+    removed: Removed,
     units: Vec<motion::Unit>,
     signals: Vec<signal::Signal>,
     sets: u64,
@@ -208,10 +209,14 @@ impl Pass {
         }
         let offset_ns = set.utc_offset_ns.saturating_sub(self.t0_ns);
         for batch in &set.motion {
-            self.units[batch.unit].batch(bins, offset_ns, batch);
+            let unit = &mut self.units[batch.unit];
+            unit.count.take(batch, set.utc_ns, &self.removed);
+            unit.batch(bins, offset_ns, batch);
         }
         for part in &set.signals {
-            self.signals[part.signal].samples(bins, offset_ns, &part.samples);
+            let signal = &mut self.signals[part.signal];
+            signal.count.take(&part.samples, set.utc_ns, &self.removed);
+            signal.samples(bins, offset_ns, &part.samples);
         }
         for s in set.missing {
             let s = &mut self.streams[s];
@@ -246,6 +251,7 @@ pub(super) fn gather(
         bins,
         t0_ns,
         streams: session.streams.iter().map(|_| Stream::new(bins)).collect(),
+        removed: Removed::of(session),
         units: session.motion.iter().map(|_| motion::Unit::new(bins)).collect(),
         signals: session.signals.iter().map(|s| signal::Signal::new(bins, s)).collect(),
         sets: 0,

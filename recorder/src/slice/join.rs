@@ -4,7 +4,7 @@ use super::books::{Books, Gap};
 use super::folder::Folder;
 use super::output::{Losses, Output};
 use super::session::{BEFORE, IN_NO_INPUT, NOT_THERE, said};
-use super::track::{self, Input, Item, Loose, Origin, Range, Source, Track};
+use super::track::{self, Input, Item, Loose, Origin, Place, Range, Source, Track};
 use super::{SliceOptions, SliceProgress, SliceReport};
 use crate::container::chunk::Chunk;
 use crate::container::copy::SetGroup;
@@ -41,8 +41,8 @@ struct Head {
     items: Receiver<Item>,
     source: Option<Arc<Source>>,
     books: Books,
-    /// Id and offered sets of the set before, and its segment.
-    before: Option<(u64, u64, Origin)>,
+    /// The set before, and its segment.
+    before: Option<(Place, Origin)>,
     next: Option<Box<SetGroup>>,
     /// The clock pair that the next set's segment begins with.
     clock: Option<Loose>,
@@ -160,7 +160,7 @@ impl<'a> Join<'a> {
                 if i == chosen {
                     output.set(&set, &source, clock, &self.losses)?;
                 }
-                head.before = Some((set.mark.id, set.mark.sets_offered, source.origin));
+                head.before = Some((Place::of(&set), source.origin));
                 head.is_pruned = false;
                 drop(set);
                 let after = self.fill(head, output)?;
@@ -189,8 +189,9 @@ impl<'a> Join<'a> {
         let inputs = self.inputs;
         for i in due {
             let head = &mut heads[*i];
-            let Some(mark) = head.next.as_ref().map(|set| &set.mark) else { continue };
-            let gap = head.gap(inputs, mark.sets_offered);
+            let Some(set) = &head.next else { continue };
+            let mark = &set.mark;
+            let gap = head.gap(inputs, Place::of(set));
             let offered = mark.sets_offered;
             let found = |counted: bool| Gap { sets: gap, counted, offered };
             let damage = std::mem::take(&mut head.damage);
@@ -226,8 +227,8 @@ impl<'a> Join<'a> {
                 ));
             }
             // With the set of another input before it, its own accounts do not count the gap.
-            let same = head.before.zip(head.source.as_ref()).is_some_and(|((before, _, origin), source)| {
-                (before == id || head.is_pruned) && origin.goes_on(source.origin, inputs)
+            let same = head.before.zip(head.source.as_ref()).is_some_and(|((before, origin), source)| {
+                (before.id == id || head.is_pruned) && origin.goes_on(source.origin, inputs)
             });
             let missing = if same { gap } else { mark.sets_offered.saturating_sub(output.offered + 1) };
             let between = format!("{missing} sets between set {id} and set {}", mark.id);
@@ -283,21 +284,22 @@ impl<'a> Join<'a> {
                     }
                     head.source = Some(source);
                 }
-                Item::Skipped(id, offered) => {
-                    let sets = head.gap(self.inputs, offered);
-                    head.books.gap(Gap { sets, counted: false, offered }, &mut self.losses);
-                    head.before = head.source.as_ref().map(|s| (id, offered, s.origin));
+                Item::Skipped(place) => {
+                    let sets = head.gap(self.inputs, place);
+                    let gap = Gap { sets, counted: false, offered: place.offered };
+                    head.books.gap(gap, &mut self.losses);
+                    head.before = head.source.as_ref().map(|s| (place, s.origin));
                     head.damage.clear();
                     for (source, message) in messages.drain(..) {
                         output.before(source, message);
                     }
                 }
-                Item::Pruned(id, offered) => {
-                    let sets = head.gap(self.inputs, offered);
+                Item::Pruned(place) => {
+                    let sets = head.gap(self.inputs, place);
                     // Only a loss beside a set that stays is one of the new dataset.
                     let counted = !head.is_pruned && output.last.is_some();
-                    head.books.gap(Gap { sets, counted, offered }, &mut self.losses);
-                    head.before = head.source.as_ref().map(|s| (id, offered, s.origin));
+                    head.books.gap(Gap { sets, counted, offered: place.offered }, &mut self.losses);
+                    head.before = head.source.as_ref().map(|s| (place, s.origin));
                     head.is_pruned = true;
                     for (source, message) in messages.drain(..) {
                         output.before(source, message);
@@ -363,14 +365,17 @@ impl Head {
     }
 
     /// Sets that were offered since the set before and are not in this track, as far as its accounts go back: what
-    /// lies between two inputs with accounts of their own is in neither.
-    fn gap(&self, inputs: &[Input<'_>], offered: u64) -> u64 {
+    /// lies between two inputs with accounts of their own is in neither. Where an earlier prune removed sets, only its accounts report
+    /// losses beside them.
+    fn gap(&self, inputs: &[Input<'_>], place: Place) -> u64 {
         let Some(source) = &self.source else { return 0 };
-        match self.before.filter(|(.., origin)| origin.goes_on(source.origin, inputs)) {
-            Some((_, before, _)) => offered.saturating_sub(before.saturating_add(1)),
+        let input = &inputs[source.origin.input];
+        match self.before.filter(|(_, origin)| origin.goes_on(source.origin, inputs)) {
+            Some((before, _)) if input.removed.is_between(before.utc_ns, place.utc_ns) => 0,
+            Some((before, _)) => place.offered.saturating_sub(before.offered.saturating_add(1)),
             None if source.is_first() => {
-                let before = inputs[source.origin.input].offered_before();
-                offered.saturating_sub(before.saturating_add(1))
+                let before = input.offered_before();
+                place.offered.saturating_sub(before.saturating_add(1))
             }
             None => 0,
         }

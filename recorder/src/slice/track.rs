@@ -3,7 +3,7 @@
 use crate::container::copy::{Damage, Group, Groups, SetGroup, read_preamble};
 use crate::container::scan::SegmentReader;
 use crate::container::segment::Preamble;
-use crate::dataset::{Dataset, Kind, kinds, segment_number};
+use crate::dataset::{Dataset, Kind, Removed, kinds, segment_number};
 use crate::msgs::accounts;
 use crate::msgs::schemas::Schema;
 use crate::recorder::topics::{SEGMENT_METADATA, SESSION_METADATA};
@@ -51,11 +51,13 @@ impl Range {
 /// A dataset or a segment to read from.
 pub(super) struct Input<'a> {
     pub(super) dataset: &'a Dataset,
+    /// Sets that an earlier prune removed from it.
+    pub(super) removed: Removed,
 }
 
 impl<'a> Input<'a> {
     pub(super) fn new(dataset: &'a Dataset) -> Self {
-        Self { dataset }
+        Self { dataset, removed: Removed::of(dataset.session()) }
     }
 
     /// Sets that were offered before its first segment begins, as its marks count.
@@ -133,14 +135,29 @@ pub(super) struct Loose {
     pub(super) data: Vec<u8>,
 }
 
+/// A set's place in its recording.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Place {
+    pub(super) id: u64,
+    /// Sets offered up to it, with it.
+    pub(super) offered: u64,
+    pub(super) utc_ns: i64,
+}
+
+impl Place {
+    pub(super) fn of(set: &SetGroup) -> Self {
+        Self { id: set.mark.id, offered: set.mark.sets_offered, utc_ns: set.log_time as i64 }
+    }
+}
+
 /// An item that a track's thread hands on.
 pub(super) enum Item {
     /// The following items are from this segment. With the last account before it, where none of it was handed on.
     Source(Arc<Source>, Option<Account>),
-    /// A set before the range: its id and how many sets were offered up to it.
-    Skipped(u64, u64),
-    /// The same of a set between others, which is left out.
-    Pruned(u64, u64),
+    /// A set before the range.
+    Skipped(Place),
+    /// A set between others, which is left out.
+    Pruned(Place),
     Set(Box<SetGroup>),
     /// Messages between two sets; `head` before the first set of a segment.
     Between {
@@ -344,7 +361,7 @@ impl Reading<'_> {
             is_damaged = matches!(group, Group::Damage(_));
             match group {
                 Group::Set(set) if (set.log_time as i64) < self.range.from_utc_ns => {
-                    self.send(Item::Skipped(set.mark.id, set.mark.sets_offered))?;
+                    self.send(Item::Skipped(Place::of(&set)))?;
                 }
                 Group::Set(set) if (set.log_time as i64) > self.range.to_utc_ns => {
                     let account = next_account(&source, &mut groups)?;
@@ -352,7 +369,7 @@ impl Reading<'_> {
                     return Err(Stop::Enough);
                 }
                 Group::Set(set) if self.range.is_pruned(session, set.log_time as i64) => {
-                    self.send(Item::Pruned(set.mark.id, set.mark.sets_offered))?;
+                    self.send(Item::Pruned(Place::of(&set)))?;
                 }
                 Group::Set(set) => self.send(Item::Set(Box::new(set)))?,
                 Group::Between(between) => {

@@ -4,7 +4,7 @@ mod set;
 
 use super::{Findings, Severity};
 use crate::container::scan::Message;
-use crate::dataset::{Kind, MotionCount};
+use crate::dataset::{Kind, MotionCount, Removed};
 use crate::msgs::frame_info;
 use crate::msgs::motion::{Batch, Imu, read_samples};
 use crate::msgs::tf::unit_frame;
@@ -160,7 +160,13 @@ impl Units {
 
 impl Unit {
     /// Checks a batch against the one before; the problems in words.
-    fn follow(&mut self, header: &FrameHeader, batch: Batch) -> Vec<String> {
+    fn follow(
+        &mut self,
+        header: &FrameHeader,
+        batch: Batch,
+        set_utc_ns: i64,
+        removed: &Removed,
+    ) -> Vec<String> {
         let mut problems = Vec::new();
         let replayed = header.flags & FrameFlags::REPLAYED.0 != 0;
         let before = self.last;
@@ -192,7 +198,8 @@ impl Unit {
         if before.is_some_and(|b| header.sequence <= b.batch) {
             problems.push("its number is not greater than that of the batch before".to_owned());
         }
-        self.count.take(&RecordMotion { unit: 0, header: *header, samples: batch.samples });
+        let batch = RecordMotion { unit: 0, header: *header, samples: batch.samples };
+        self.count.take(&batch, set_utc_ns, removed);
         // One line is enough for a batch whose samples are all out of order.
         problems.truncate(3);
         problems

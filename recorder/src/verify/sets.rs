@@ -7,6 +7,7 @@ use super::signals::Signals;
 use super::{Findings, Severity, VerifyOptions};
 use crate::clock::step_ns;
 use crate::container::record::{op, put_le};
+use crate::dataset::Removed;
 use crate::encode::Codec;
 use crate::msgs::frame_info::Extra;
 use crate::msgs::frame_set::{FrameSetMsg, Member};
@@ -43,6 +44,7 @@ pub(super) struct Walk {
     frame_accounts: BTreeMap<StreamId, FrameAccount>,
     pub(super) units: Units,
     pub(super) signals: Signals,
+    pub(super) removed: Removed,
     /// The first and the last reading of the host's clocks.
     clocks: Option<(UtcPair, UtcPair)>,
 }
@@ -82,6 +84,7 @@ impl Walk {
             frame_accounts: BTreeMap::new(),
             units: Units::new(session),
             signals: Signals::new(session),
+            removed: Removed::of(session),
             clocks: None,
         }
     }

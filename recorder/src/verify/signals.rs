@@ -4,7 +4,7 @@ mod set;
 
 use super::{Findings, Severity};
 use crate::container::scan::Message;
-use crate::dataset::{Kind, SignalCount};
+use crate::dataset::{Kind, Removed, SignalCount};
 use crate::{Session, SignalRecord};
 use depthrig_bus::{SignalFlags, SignalSample, StreamId};
 use std::collections::BTreeMap;
@@ -106,7 +106,8 @@ impl Signals {
         problems
     }
 
-    /// Adds the findings at the end. What is missing was lost live, as with IMUs.
+    /// Adds the findings at the end. What is missing was lost live, as with IMUs; samples of
+    /// removed sets are not missing.
     pub(super) fn finish(&self, end_ns: Option<i64>, findings: &mut Findings) {
         for (id, signal) in &self.0 {
             for what in signal.count.in_words(id, end_ns) {
@@ -118,7 +119,7 @@ impl Signals {
 
 impl Signal {
     /// Checks samples against those before; the problems in words.
-    fn follow(&mut self, samples: &[SignalSample]) -> Vec<String> {
+    fn follow(&mut self, samples: &[SignalSample], set_utc_ns: i64, removed: &Removed) -> Vec<String> {
         let mut problems = Vec::new();
         for sample in samples {
             let h = sample.header();
@@ -134,7 +135,7 @@ impl Signal {
                 problems.push(format!("the time of sample {number} is not later than that before it"));
             }
         }
-        self.count.take(samples);
+        self.count.take(samples, set_utc_ns, removed);
         problems.truncate(3);
         problems
     }

@@ -1,11 +1,13 @@
 //! Pruning: discarded episodes go for good, and the rest is as it was, whatever fails on the way.
 
 use crate::support::*;
+use crate::verify::found;
+use depthrig_bus::SignalSample;
 use depthrig_recorder::fs::{Fault, Fs, MemFs, WriteFile, write_all};
 use depthrig_recorder::{
-    CompareOptions, Comparison, Dataset, Edge, Episode, ErrorKind, PixelCheck, Pruned, Recorder,
-    RecorderOptions, Session, SetSpan, Severity, SliceOptions, VerifyOptions, compare_with, prunable, prune,
-    trim, verify_with,
+    CompareOptions, Comparison, Dataset, Edge, Episode, EpisodeEnd, ErrorKind, PixelCheck, Pruned, Recorder,
+    RecorderOptions, Session, SessionChanges, SetSpan, Severity, SliceOptions, VerifyOptions, compare_with,
+    edit, prunable, prune, trim, verify_with,
 };
 use proptest::prelude::*;
 use std::io;
@@ -248,6 +250,89 @@ fn on_a_file_system_that_cannot_exchange_names_the_folders_are_renamed() {
         let found = Dataset::open_with(shared(&left), &Path::new("/data").join(name)).unwrap();
         assert_eq!(found.sets(depthrig_recorder::SetRange::ALL).flatten().count(), sets);
     }
+}
+
+/// Ten sets of which a session of samples and two runs of sets go; beside these, samples and batches of kept sets are lost.
+#[test]
+fn samples_that_went_with_their_episodes_are_not_lost() {
+    let episodes = [episode(1, 0, 2, false), episode(2, 3, 4, true), episode(3, 9, 9, true)];
+    let session = Session { episodes: episodes.to_vec(), ..session() };
+    let record = |spoils: bool, restarts: bool| {
+        let fs = MemFs::new();
+        let r = Recorder::create(shared(&fs), &dir(), session.clone(), short()).unwrap();
+        for n in 0..10 {
+            let mut set = set(&session, n);
+            if spoils && n == 1 {
+                set.signals[0].samples.remove(2);
+                set.motion.remove(0);
+            }
+            // Beside the removed sets, where nobody can tell them from those that went.
+            if spoils && n == 5 {
+                set.signals[0].samples.remove(0);
+            }
+            if spoils && n == 7 {
+                set.signals[1].samples.drain(1..4);
+            }
+            if restarts && n > 3 {
+                let later = |s: &SignalSample| {
+                    let mut header = *s.header();
+                    (header.session, header.sequence) = (99, header.sequence - 3 * SIGNAL_SAMPLES);
+                    SignalSample::new(header, s.description(), s.bytes().to_vec()).unwrap()
+                };
+                set.signals[0].samples = set.signals[0].samples.iter().map(later).collect();
+            }
+            r.push(set).unwrap();
+            settle(&r);
+        }
+        r.finish().unwrap();
+        assert_eq!(pruned(&fs).unwrap().removed.sets, 3);
+        fs
+    };
+    let rates = |fs: &MemFs| {
+        let info = open(fs).info().unwrap();
+        let lost: Vec<_> =
+            info.signals.iter().map(|s| s.lost).chain(info.motion.iter().map(|u| u.lost_batches)).collect();
+        let rates = info
+            .signals
+            .iter()
+            .map(|s| s.rate_hz)
+            .chain(info.motion.iter().map(|u| u.rate_hz))
+            .collect::<Vec<f64>>();
+        (lost, rates)
+    };
+    let whole = record(false, false);
+    assert_eq!(found(&whole), Vec::<String>::new());
+    let signal_hz = SIGNAL_SAMPLES as f64 * 1e9 / PERIOD as f64;
+    let (lost, hz) = rates(&whole);
+    assert_eq!(lost, [0; 4]);
+    for (hz, expected) in
+        hz.iter().zip([signal_hz, signal_hz, 1e9 / SAMPLE_PERIOD as f64, 1e9 / SAMPLE_PERIOD as f64])
+    {
+        assert!((hz - expected).abs() < 1e-6 * expected, "{hz} is not {expected}");
+    }
+    assert_eq!(
+        found(&record(false, true)),
+        Vec::<String>::new(),
+        "the publisher began anew in a removed set"
+    );
+    let expected = [
+        "1 batches of front/imu were not recorded",
+        "1 samples of arm/joints were not recorded",
+        "3 samples of arm/gripper were not recorded",
+    ];
+    let lossy = record(true, false);
+    let mut notes = found(&lossy);
+    notes.sort();
+    assert_eq!(notes, expected);
+    assert_eq!(rates(&lossy).0, [1, 3, 1, 0]);
+    // A part of it knows as well, and so does the dataset when more of it goes.
+    let later = part(&lossy, 2, 7);
+    let verified = verify_with(&shared(&lossy), later.path(), &VerifyOptions::default()).unwrap();
+    assert_eq!(verified.findings.iter().map(|f| f.message.as_str()).collect::<Vec<_>>(), expected[1..2]);
+    let discard = SessionChanges { episodes: vec![(1, EpisodeEnd::Discarded)], ..SessionChanges::default() };
+    edit(&lossy, &dir(), &discard).unwrap();
+    assert_eq!(pruned(&lossy).unwrap().removed.sets, 3);
+    assert_eq!(found(&lossy), expected[2..]);
 }
 
 proptest! {

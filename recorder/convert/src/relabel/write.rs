@@ -74,6 +74,7 @@ impl<'a> Write<'a> {
             first_utc_ns: reader.times().first().copied().unwrap_or_default(),
             last_utc_ns: reader.times().last().copied().unwrap_or_default(),
             offered_before: 0,
+            removed: Vec::new(),
         });
         let mut facts = ImportFacts { accounts: dataset.info()?.accounts, ..ImportFacts::default() };
         reader.problems().iter().for_each(|problem| facts.lose(problem.clone()));

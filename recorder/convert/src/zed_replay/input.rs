@@ -373,6 +373,7 @@ fn derived(path: &Path, first_utc_ns: i64, last_utc_ns: i64) -> Derived {
         first_utc_ns,
         last_utc_ns,
         offered_before: 0,
+        removed: Vec::new(),
     }
 }
 

@@ -6,7 +6,7 @@ use crate::report::series::{TimeBins, Values};
 use crate::{MotionRecord, RecordMotion, StreamAccount};
 
 pub(super) struct Unit {
-    count: MotionCount,
+    pub(super) count: MotionCount,
     gyro: Values,
     accel: Values,
 }
@@ -16,9 +16,8 @@ impl Unit {
         Self { count: MotionCount::default(), gyro: Values::new(bins), accel: Values::new(bins) }
     }
 
-    /// A batch; `offset_ns` added to a time of its samples is the time since the first set.
+    /// Adds a batch, which is counted already; `offset_ns` added to a time of its samples is the time since the first set.
     pub(super) fn batch(&mut self, bins: TimeBins, offset_ns: i64, batch: &RecordMotion) {
-        self.count.take(batch);
         for s in &batch.samples {
             let at = s.time_ns.saturating_add(offset_ns);
             for (values, three) in [(&mut self.gyro, s.gyro_rad_s), (&mut self.accel, s.accel_m_s2)] {

@@ -10,7 +10,7 @@ use depthrig_bus::{SignalSample, Value};
 const PLOTTED: usize = 16;
 
 pub(super) struct Signal {
-    count: SignalCount,
+    pub(super) count: SignalCount,
     names: Vec<String>,
     values: Vec<Values>,
 }
@@ -32,9 +32,8 @@ impl Signal {
         Self { count: SignalCount::default(), names, values }
     }
 
-    /// Samples; `offset_ns` added to their times is the time since the first set.
+    /// Adds samples, which are counted already; `offset_ns` added to their times is the time since the first set.
     pub(super) fn samples(&mut self, bins: TimeBins, offset_ns: i64, samples: &[SignalSample]) {
-        self.count.take(samples);
         for sample in samples {
             let at = sample.header().time_ns.saturating_add(offset_ns);
             for (values, x) in self.values.iter_mut().zip(sample.values().filter_map(Value::number)) {

@@ -72,7 +72,7 @@ impl Join<'_> {
 impl Head {
     /// Whether its last set is this one.
     fn ends_with(&self, id: u64) -> bool {
-        !self.beyond && self.before.is_some_and(|(before, ..)| before == id)
+        !self.beyond && self.before.is_some_and(|(before, ..)| before.id == id)
     }
 
     /// Takes how its dataset ended, as that says itself.

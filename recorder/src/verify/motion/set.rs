@@ -23,6 +23,7 @@ pub(in crate::verify) fn set(
         problems.push(format!("{n} batches of {unit} have no frame_info"));
     }
     let mut expected: BTreeMap<StreamId, Vec<Imu>> = BTreeMap::new();
+    let set_utc_ns = i64::try_from(log_time).unwrap_or(i64::MAX);
     for batch in batches {
         let Waiting { unit: id, log_time: at, header, stamp_utc_ns, is_named, samples } = batch;
         let mut say = |what: &str| problems.push(format!("batch {} of {id}: {what}", header.sequence));
@@ -57,7 +58,8 @@ pub(in crate::verify) fn set(
         }
         let single = samples.samples.iter().map(|s| Imu::of(s, set.utc_offset_ns));
         expected.entry(id.clone()).or_default().extend(single);
-        unit.follow(&header, samples).iter().for_each(|what| say(what));
+        let found = unit.follow(&header, samples, set_utc_ns, &walk.removed);
+        found.iter().for_each(|what| say(what));
     }
     for (id, expected) in expected {
         let got = single.remove(&id).unwrap_or_default();

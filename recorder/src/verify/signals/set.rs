@@ -21,6 +21,7 @@ pub(in crate::verify) fn set(
     let mut expected: BTreeMap<StreamId, Vec<Single>> = BTreeMap::new();
     let compares = walk.compares_singles;
     let mut message = Vec::new();
+    let set_utc_ns = i64::try_from(log_time).unwrap_or(i64::MAX);
     for Part { signal: id, log_time: at, message: stored } in parts {
         // Its channels have that finding already.
         let Some(signal) = walk.signals.0.get_mut(&id) else { continue };
@@ -53,8 +54,8 @@ pub(in crate::verify) fn set(
             Single { publish_time, crc32: crc32fast::hash(&message) }
         });
         expected.entry(id.clone()).or_default().extend(single);
-        problems
-            .extend(signal.follow(&samples.samples).into_iter().map(|what| format!("signal {id}: {what}")));
+        let found = signal.follow(&samples.samples, set_utc_ns, &walk.removed);
+        problems.extend(found.into_iter().map(|what| format!("signal {id}: {what}")));
     }
     for (id, expected) in expected {
         let got = single.remove(&id).unwrap_or_default();
