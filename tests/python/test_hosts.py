@@ -281,6 +281,7 @@ def test_kills_at_any_moment_lose_nothing_that_was_recorded(rig: Rig) -> None:
         assert joined.name == f"{name}_joined"
         parts = [rig.data("here") / part["name"] for part in rig.session()["parts"]]
         check_joined(rig, joined, rig.data("here") / name, parts)
+        print(f"{name}: {victim}, {len(parts)} parts")
 
 
 def test_a_host_that_comes_late_gets_its_part_then(rig: Rig) -> None:

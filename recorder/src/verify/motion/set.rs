@@ -59,7 +59,9 @@ pub(in crate::verify) fn set(
         let single = samples.samples.iter().map(|s| Imu::of(s, set.utc_offset_ns));
         expected.entry(id.clone()).or_default().extend(single);
         let found = unit.follow(&header, samples, set_utc_ns, &walk.removed);
-        found.iter().for_each(|what| say(what));
+        for what in &found {
+            say(what);
+        }
     }
     for (id, expected) in expected {
         let got = single.remove(&id).unwrap_or_default();
