@@ -4,12 +4,14 @@
 //! set, images stay as they were stored, and times are those of the session's clock ([`crate::replay`]). The dataset grows in a hidden
 //! folder and gets its name when it is verified and has every frame of the parts.
 
+use crate::config::RecordingConfig;
 use crate::control::RecordRequest;
+use crate::recording::reserve_bytes;
 use crate::replay::{Replay, ReplayOptions};
 use crate::{Error, ErrorKind, Result};
 use core::ops::ControlFlow;
 use core::time::Duration;
-use depthrig_bus::{RuntimeDir, umask};
+use depthrig_bus::{RuntimeDir, shm, umask};
 use depthrig_recorder::fs::{Fs, RealFs};
 use depthrig_recorder::{Dataset, Severity, VerifyOptions, adopt, verify_watched};
 use std::collections::BTreeMap;
@@ -54,6 +56,7 @@ pub fn join(parts: &[PathBuf], out: &Path, runtime: &RuntimeDir, stop: &AtomicBo
         Error::new(ErrorKind::Other, format!("{}: {e}", path.display())).with_source(e)
     };
     umask::create_dir_all(&hidden).map_err(|e| failed(&hidden, e))?;
+    must_fit(parts, &hidden)?;
     let growing = hidden.join(name);
     let options = ReplayOptions {
         as_fast_as_possible: true,
@@ -85,6 +88,25 @@ fn has_sets(part: &Path) -> bool {
     info.map_or(true, |info| info.sets > 0)
 }
 
+/// The result is about as large as its parts; recordings must find room after it.
+fn must_fit(parts: &[PathBuf], folder: &Path) -> Result<()> {
+    let mut needed = reserve_bytes(&RecordingConfig::default());
+    for part in parts {
+        needed = needed.saturating_add(Dataset::open(part)?.info()?.bytes);
+    }
+    let free = shm::free_bytes(folder)?;
+    if free >= needed {
+        return Ok(());
+    }
+    let what = format!(
+        "{} has {} MB free, and {} MB are needed to join the parts and to record after that; make room, then call depthrig merge --hosts",
+        folder.display(),
+        free / 1_000_000,
+        needed / 1_000_000
+    );
+    Err(Error::new(ErrorKind::NoSpace, what))
+}
+
 fn remove(folder: &Path) -> std::io::Result<()> {
     match fs::remove_dir_all(folder) {
         Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(e),
@@ -95,7 +117,7 @@ fn remove(folder: &Path) -> std::io::Result<()> {
 /// Records the replay to its end.
 fn record(replay: Replay, directory: &Path, name: &str, stop: &AtomicBool) -> Result<()> {
     let control = replay.control();
-    // The parts were measured against the disk before; how fast a replay writes says nothing about how long the disk lasts.
+    // Its size was held against the disk; how fast a replay writes says nothing about how long the disk lasts.
     let request = RecordRequest {
         directory: Some(directory.to_owned()),
         name: Some(name.to_owned()),
