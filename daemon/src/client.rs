@@ -25,7 +25,7 @@ const TIMEOUT: Duration = Duration::from_secs(10);
 /// How long closing a recording may take: the disk decides.
 const STOP_TIMEOUT: Duration = Duration::from_mins(10);
 
-/// How long a call to another computer may take.
+/// Timeout of a call to another computer.
 const HOST_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// A client of one rig's daemon. Not for use inside an async runtime: its calls block.
@@ -87,7 +87,7 @@ impl Client {
         Ok(Self { rig: rig.clone(), runtime: runtime.clone(), host: Some(host.clone()), connector })
     }
 
-    /// How long a call that is answered at once may take.
+    /// Timeout of a call that is answered at once.
     const fn timeout(&self) -> Duration {
         if self.host.is_some() { HOST_TIMEOUT } else { TIMEOUT }
     }

@@ -93,11 +93,11 @@ pub struct LinkConfig {
 pub struct HostConfig {
     /// Its name in the rig.
     pub name: Name,
-    /// How its daemon's control socket is reached.
+    /// The way to its daemon's control socket.
     pub reach: Reach,
 }
 
-/// How the control socket of another daemon is reached.
+/// The way to the control socket of another daemon.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Reach {
     /// With OpenSSH.

@@ -44,7 +44,7 @@ pub type JoinParts = fn(&[PathBuf], &Path, &RuntimeDir, &AtomicBool) -> Result<u
 /// From one look at a host to the next while nothing is pulled from it.
 const LOOK: Duration = Duration::from_millis(500);
 /// A start and a stop wait so long for the hosts that answer; they go on behind it.
-const PATIENCE: Duration = Duration::from_secs(5);
+const SETTLE_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Folders of the parts that were pulled of the recording in `folder`.
 ///
@@ -134,7 +134,7 @@ impl Hosts {
         }))
     }
 
-    /// How many there are; each has a thread of its own.
+    /// Number of hosts; each has a thread of its own.
     pub const fn count(&self) -> usize {
         self.others.len()
     }
@@ -171,7 +171,7 @@ impl Hosts {
     /// Wakes the threads of all hosts, and waits until `is_done` of each that is connected and the newest session.
     fn settle(&self, is_done: impl Fn(&Host, &Session) -> bool) {
         self.changed.notify_all();
-        let deadline = HostTime::now().plus(PATIENCE);
+        let deadline = HostTime::now().plus(SETTLE_TIMEOUT);
         let mut sessions = lock(&self.sessions);
         while !deadline.from_now().is_zero() {
             let Some(session) = sessions.newest() else { return };
@@ -286,7 +286,7 @@ impl Hosts {
         is_new
     }
 
-    /// Why a daemon that answers cannot be this host of the rig.
+    /// The reason to refuse a daemon that answers as this host; `None` without one.
     fn refusal(&self, host: &Host, status: &RigStatus, cameras: &[String]) -> Option<String> {
         let name = &host.config.name;
         if status.rig != self.rig.as_str() {

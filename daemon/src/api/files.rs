@@ -37,7 +37,7 @@ pub struct BytesRequest {
     pub file: String,
     /// First byte.
     pub offset: u64,
-    /// How many; an answer has [`MAX_PART_BYTES`] at the most, and fewer at the file's end.
+    /// Number of bytes; an answer has [`MAX_PART_BYTES`] at the most, and fewer at the file's end.
     pub length: u64,
 }
 
@@ -68,7 +68,7 @@ pub struct FileDigest {
     pub crc32: u32,
 }
 
-/// Whether a file of this name is one that is served: the session or a segment, complete or not.
+/// Recognises the names of files that are served: the session or a segment, complete or not.
 pub fn is_served(file: &str) -> bool {
     let number = |name: &str| {
         let digits = name.strip_prefix("seg_")?.strip_suffix(".mcap")?;

@@ -15,7 +15,7 @@ pub struct Way {
     pub host: Name,
     /// As `ssh` names it.
     pub destination: String,
-    /// How fast it is, or why nothing came through.
+    /// Its rates, or the reason that nothing came through.
     pub rates: Result<Rates, String>,
 }
 

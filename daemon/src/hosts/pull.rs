@@ -32,7 +32,7 @@ pub(super) struct Pull<'a> {
     pub(super) stop: &'a AtomicBool,
 }
 
-/// How far it has come.
+/// Progress of a part.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(super) struct Pulled {
     /// Bytes of its segments there.

@@ -27,7 +27,7 @@ pub(super) struct Session {
     pub(super) folder: PathBuf,
     /// It is being recorded now.
     pub(super) goes_on: bool,
-    /// How parts are begun, while it goes on.
+    /// The request that parts are begun with, while it goes on.
     request: RecordRequest,
     /// When it ends by itself.
     ends: Option<HostTime>,
