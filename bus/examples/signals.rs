@@ -4,10 +4,12 @@
 //! cargo run -p depthrig-bus --example signals -- publish RUNTIME_DIR
 //! cargo run -p depthrig-bus --example signals -- read RUNTIME_DIR DEVICE/SIGNAL COUNT
 //! cargo run -p depthrig-bus --example signals -- dump FOLDER
+//! cargo run --release -p depthrig-bus --example signals -- time RUNTIME_DIR SECONDS
 //! ```
 //! `publish` waits for a number on stdin, publishes that many samples of `test/arm`, `test/mixed` and `test/tool_pose`, prints
 //! the last sequence number, and so on until stdin ends. Sample k has the time 1 s + k · 10 ms. `read` prints a JSON object
-//! for each sample. `dump` writes a header with a distinct value in every field, as bytes and as JSON.
+//! for each sample. `dump` writes a header with a distinct value in every field, as bytes and as JSON. `time` publishes twenty
+//! signals of seven doubles a thousand times a second, and prints how long a call takes.
 
 use depthrig_bus::{
     FieldType, HostTime, RuntimeDir, SignalDescription, SignalField, SignalFlags, SignalHeader, SignalSample,
@@ -27,8 +29,33 @@ fn main() -> Result<(), Box<dyn Error>> {
         ["publish", folder] => publish(folder.as_ref()),
         ["read", folder, name, count] => read(folder.as_ref(), name, count.parse()?),
         ["dump", folder] => dump(folder.as_ref()),
-        _ => Err("publish RUNTIME_DIR, read RUNTIME_DIR DEVICE/SIGNAL COUNT, or dump FOLDER".into()),
+        ["time", folder, seconds] => time(folder.as_ref(), seconds.parse()?),
+        _ => Err("publish RUNTIME_DIR, read RUNTIME_DIR DEVICE/SIGNAL COUNT, dump FOLDER, or time RUNTIME_DIR SECONDS".into()),
     }
+}
+
+fn time(folder: &Path, seconds: u32) -> Result<(), Box<dyn Error>> {
+    let signals = Signals::open(&RuntimeDir::at(folder)?)?;
+    let joints = ["j0", "j1", "j2", "j3", "j4", "j5", "j6"];
+    let mut publishers = Vec::new();
+    for i in 0..20 {
+        let name = format!("time/s{i}").parse()?;
+        publishers.push(signals.publisher(&SignalDescription::joints(name, &joints, "rad")?)?);
+    }
+    let mut took_ns = Vec::with_capacity(20_000 * seconds as usize);
+    let begun = HostTime::now();
+    for k in 0..1000 * i64::from(seconds) {
+        std::thread::sleep(begun.plus_ns(k * 1_000_000).from_now());
+        for publisher in &mut publishers {
+            let before = HostTime::now();
+            publisher.publish([k as f64; 7])?;
+            took_ns.push(HostTime::now().since_ns(before));
+        }
+    }
+    took_ns.sort_unstable();
+    let at = |share: f64| took_ns[(share * (took_ns.len() - 1) as f64) as usize] as f64 / 1e3;
+    println!("p50 {:.1}, p99 {:.1}, p99.9 {:.1} us", at(0.5), at(0.99), at(0.999));
+    Ok(())
 }
 
 fn publish(folder: &Path) -> Result<(), Box<dyn Error>> {
