@@ -182,6 +182,22 @@ impl FrameHeader {
         self.magic == MAGIC && self.version == HEADER_VERSION && self.size as usize == HEADER_SIZE
     }
 
+    /// The header of these bytes, whatever they are: [`Self::is_valid`] says whether they are one.
+    #[allow(unsafe_code)]
+    pub const fn from_bytes(bytes: &[u8; HEADER_SIZE]) -> Self {
+        // SAFETY: all fields are integers, floats and arrays of them, for which every bit pattern is a value; the sizes are equal or this
+        // would not compile.
+        unsafe { core::mem::transmute::<[u8; HEADER_SIZE], Self>(*bytes) }
+    }
+
+    /// The bytes of the header, as they lie in shared memory.
+    #[allow(unsafe_code)]
+    pub const fn to_bytes(&self) -> [u8; HEADER_SIZE] {
+        // SAFETY: the type is `#[repr(C)]` and its fields cover every byte ([`FIELDS`] has no gap, which a test holds), so no byte is
+        // uninitialised padding; the sizes are equal or this would not compile.
+        unsafe { core::mem::transmute::<Self, [u8; HEADER_SIZE]>(*self) }
+    }
+
     /// The pixel format, if this version knows it.
     pub fn pixel_format(&self) -> Option<PixelFormat> {
         PixelFormat::from_code(self.format)

@@ -18,6 +18,7 @@ mod allowed;
 mod events;
 mod files;
 mod foxglove;
+mod frames;
 mod guard;
 mod limits;
 mod live;

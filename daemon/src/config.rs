@@ -26,7 +26,7 @@ pub use error::{ConfigError, Problem};
 pub use stereo::StereoConfig;
 
 use crate::family::{FAMILIES, Family};
-use depthrig_bus::{CameraName, Name, Pose, RigName, SignalName, StreamName};
+use depthrig_bus::{CameraName, Name, Pose, RigName, SignalName, StreamId, StreamName};
 use depthrig_calibrate::file::{CalibratedCamera, Calibration, DepthCorrection, lens_position};
 use depthrig_driver::{StreamProfile, StreamRequest};
 use depthrig_stereo::StereoOptions;
@@ -95,6 +95,8 @@ pub struct HostConfig {
     pub name: Name,
     /// The way to its daemon's control socket.
     pub reach: Reach,
+    /// Its streams that subscribers of this computer read.
+    pub mirror: Vec<StreamId>,
 }
 
 /// The way to the control socket of another daemon.

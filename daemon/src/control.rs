@@ -5,10 +5,11 @@ pub use crate::losses::{LossBucket, Losses, RecordingLosses};
 use crate::sets::Rhythm;
 use crate::status::{RecordingStatus, ReplayStatus, RigStatus};
 use crate::{Error, ErrorKind, Result};
-use depthrig_bus::{RigName, RuntimeDir, UtcPair};
+use depthrig_bus::{HostTime, RigName, RuntimeDir, UtcPair};
 use depthrig_calibrate::file::CalibratedCamera;
 use depthrig_calibrate::mount::UncertaintyMap;
 use depthrig_driver::controls::ControlValue;
+use depthrig_link::Reading;
 use depthrig_recorder::{Episode, EpisodeOutcome, Mark, RecorderOptions, Session};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -129,6 +130,11 @@ pub trait Control: Send + Sync {
 
     /// When the recording in progress, or the last one, lost something; `None` before the first.
     fn record_losses(&self) -> Option<RecordingLosses> {
+        None
+    }
+
+    /// The clock of the session minus this computer's at a time of this computer's; `None` if it is not known, or this computer's.
+    fn session_clock(&self, _at: HostTime) -> Option<Reading> {
         None
     }
 

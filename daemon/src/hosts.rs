@@ -23,6 +23,7 @@ mod visit;
 use crate::client::Client;
 use crate::config::{HostConfig, Reach, RigConfig};
 use crate::control::{GridRequest, RecordRequest};
+use crate::mirror::Mirror;
 use crate::recording::reserve_bytes;
 use crate::sets::Grid;
 use crate::status::{CameraState, HostState, HostStatus, HostsStatus, JoinState, RecordingStatus, RigStatus};
@@ -85,6 +86,19 @@ struct Host {
     seen: Mutex<HostStatus>,
     /// Cameras there, at the last look.
     cameras: Mutex<Vec<String>>,
+    /// Its streams that come here.
+    mirrors: Vec<Mirror>,
+}
+
+impl Host {
+    fn status(&self) -> HostStatus {
+        let mirrors = self.mirrors.iter().map(Mirror::status).collect();
+        HostStatus { mirrors, ..lock(&self.seen).clone() }
+    }
+
+    fn is_connected(&self) -> bool {
+        lock(&self.seen).state == HostState::Connected
+    }
 }
 
 impl Hosts {
@@ -118,10 +132,20 @@ impl Hosts {
             streaming: 0,
             has_clock: false,
             recording: None,
+            mirrors: Vec::new(),
+        };
+        let mirrors = |h: &HostConfig| {
+            let socket = runtime.host_socket_path(&config.rig, &h.name);
+            h.mirror.iter().map(|id| Mirror::new(id.clone(), &config.rig, runtime, socket.clone())).collect()
         };
         Ok(Some(Self {
             others: (link.hosts.iter())
-                .map(|h| Host { config: h.clone(), seen: Mutex::new(seen(h)), cameras: Mutex::default() })
+                .map(|h| Host {
+                    config: h.clone(),
+                    seen: Mutex::new(seen(h)),
+                    cameras: Mutex::default(),
+                    mirrors: mirrors(h),
+                })
                 .collect(),
             sessions: Mutex::new(Sessions::left_in(&config.recording.directory)),
             changed: Condvar::new(),
@@ -142,7 +166,7 @@ impl Hosts {
     /// State of the hosts, and of the newest recording.
     pub fn status(&self) -> HostsStatus {
         HostsStatus {
-            hosts: self.others.iter().map(|host| lock(&host.seen).clone()).collect(),
+            hosts: self.others.iter().map(Host::status).collect(),
             session: lock(&self.sessions).newest().map(Session::status),
         }
     }
@@ -175,8 +199,7 @@ impl Hosts {
         let mut sessions = lock(&self.sessions);
         while !deadline.from_now().is_zero() {
             let Some(session) = sessions.newest() else { return };
-            let is_away = |host: &Host| lock(&host.seen).state != HostState::Connected;
-            if self.others.iter().all(|host| is_away(host) || is_done(host, session)) {
+            if self.others.iter().all(|host| !host.is_connected() || is_done(host, session)) {
                 return;
             }
             let waited = self.changed.wait_timeout(sessions, deadline.from_now().min(LOOK));
@@ -200,9 +223,7 @@ impl Hosts {
             let looked = client.status();
             let is_new = self.note(host, looked.as_ref(), tunnel.as_ref());
             let is_busy = match &looked {
-                Ok(status) if lock(&host.seen).state == HostState::Connected => {
-                    self.visit(host, &client, status, stop)
-                }
+                Ok(status) if host.is_connected() => self.visit(host, &client, status, stop),
                 _ => false,
             };
             self.share_grid(host, &client);
@@ -215,6 +236,22 @@ impl Hosts {
             }
         }
         Ok(())
+    }
+
+    /// Number of streams of all hosts whose frames come here; each has a thread of its own.
+    pub fn mirrored(&self) -> usize {
+        self.others.iter().map(|host| host.mirrors.len()).sum()
+    }
+
+    /// Publishes the frames of mirrored stream `number` here until `stop`.
+    ///
+    /// # Errors
+    /// When this rig's bus cannot be opened.
+    pub fn mirror(&self, number: usize, stop: &AtomicBool) -> Result<()> {
+        let mut all =
+            self.others.iter().flat_map(|host| host.mirrors.iter().map(move |mirror| (host, mirror)));
+        let Some((host, mirror)) = all.nth(number) else { return Ok(()) };
+        mirror.run(&|| host.is_connected(), stop)
     }
 
     /// Says where the ticks lie, and hears of the streams there.

@@ -20,6 +20,7 @@ pub mod joining;
 mod link;
 mod losses;
 pub mod metrics;
+mod mirror;
 mod priority;
 mod recording;
 pub mod replay;

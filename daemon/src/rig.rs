@@ -369,7 +369,7 @@ impl Rig {
         Ok(())
     }
 
-    /// A thread for each other computer, and one that joins what they recorded.
+    /// A thread for each other computer, one for each of their streams that come here, and one that joins what they recorded.
     fn keep_hosts(&mut self) -> Result<()> {
         let Some(hosts) = self.inner.hosts.clone() else { return Ok(()) };
         for number in 0..hosts.count() {
@@ -378,6 +378,14 @@ impl Rig {
             self.spawn("host", move |stop| {
                 let kept = hosts.keep(number, &|| inner.recording().active_path(), stop);
                 if let Err(e) = kept {
+                    tracing::error!("{e}");
+                }
+            })?;
+        }
+        for number in 0..hosts.mirrored() {
+            let hosts = Arc::clone(&hosts);
+            self.spawn("mirror", move |stop| {
+                if let Err(e) = hosts.mirror(number, stop) {
                     tracing::error!("{e}");
                 }
             })?;

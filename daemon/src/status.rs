@@ -2,7 +2,9 @@
 
 mod hosts;
 
-pub use hosts::{HostState, HostStatus, HostsStatus, JoinState, PartStatus, SessionStatus};
+pub use hosts::{
+    HostState, HostStatus, HostsStatus, JoinState, MirrorState, MirrorStatus, PartStatus, SessionStatus,
+};
 
 use depthrig_recorder::Episode;
 use serde::{Deserialize, Serialize};

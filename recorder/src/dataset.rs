@@ -7,7 +7,7 @@ use crate::{Error, ErrorKind, Result, SESSION_FILE, Session};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-mod decode;
+pub(crate) mod decode;
 mod filter;
 mod index;
 mod info;

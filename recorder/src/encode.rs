@@ -205,37 +205,50 @@ impl ImageWriter {
     pub(crate) fn write(&mut self, buf: &mut Vec<u8>, image: &ImageJob<'_>) -> Result<()> {
         let ImageJob { header: h, format, pixels, stored, codec, packing, frame_id, stamp_utc_ns } = *image;
         let stamp = stamp_utc_ns;
-        let quality = self.quality;
-        let repacked = &mut self.repacked;
-        let depth = &mut self.depth;
-        let again = |out: &mut Vec<u8>, stored: &[u8]| {
-            out.extend_from_slice(stored);
-            Ok(())
-        };
         let shape = DepthShape { width: h.width, height: h.height, step: h.stride };
+        let encode = |out: &mut Vec<u8>| match stored {
+            Some(stored) => {
+                out.extend_from_slice(stored);
+                Ok(())
+            }
+            None => self.encode(out, codec, h, pixels, packing),
+        };
         match (codec, format.ros_encoding()) {
             (Codec::Raw, Some(encoding)) => {
                 image::write_image(buf, stamp, frame_id, h, encoding, pixels);
                 Ok(())
             }
             (Codec::Raw, None) => Err(as_they_are(format)),
-            (Codec::Mjpeg, _) => image::write_compressed(buf, stamp, frame_id, "jpeg", |out| {
+            (Codec::Mjpeg | Codec::Jpeg, _) => image::write_compressed(buf, stamp, frame_id, "jpeg", encode),
+            (Codec::Png, _) => image::write_compressed(buf, stamp, frame_id, "png", encode),
+            (Codec::Rank, _) => {
+                image::write_compressed_depth(buf, stamp, frame_id, shape, DEPTH_CODEC, encode)
+            }
+        }
+    }
+
+    /// Appends the image alone, without a message around it.
+    ///
+    /// # Errors
+    /// As [`Self::write`].
+    pub(crate) fn encode(
+        &mut self,
+        out: &mut Vec<u8>,
+        codec: Codec,
+        h: &FrameHeader,
+        pixels: &[u8],
+        packing: CompressionType,
+    ) -> Result<()> {
+        match codec {
+            Codec::Raw | Codec::Mjpeg => {
                 out.extend_from_slice(pixels);
                 Ok(())
-            }),
-            (Codec::Jpeg, _) => image::write_compressed(buf, stamp, frame_id, "jpeg", |out| match stored {
-                Some(stored) => again(out, stored),
-                None => jpeg(out, h, format, pixels, quality, repacked),
-            }),
-            (Codec::Png, _) => image::write_compressed(buf, stamp, frame_id, "png", |out| match stored {
-                Some(stored) => again(out, stored),
-                None => png(out, h, format, pixels, packing, repacked),
-            }),
-            (Codec::Rank, _) => {
-                image::write_compressed_depth(buf, stamp, frame_id, shape, DEPTH_CODEC, |out| match stored {
-                    Some(stored) => again(out, stored),
-                    None => depth.get_or_insert_default().encode(pixels, shape, out),
-                })
+            }
+            Codec::Jpeg => jpeg(out, h, pixels, self.quality, &mut self.repacked),
+            Codec::Png => png(out, h, pixels, packing, &mut self.repacked),
+            Codec::Rank => {
+                let shape = DepthShape { width: h.width, height: h.height, step: h.stride };
+                self.depth.get_or_insert_default().encode(pixels, shape, out)
             }
         }
     }
@@ -245,9 +258,9 @@ fn as_they_are(format: PixelFormat) -> Error {
     Error::new(ErrorKind::BadInput, format!("{} images cannot be stored as they are", format.name()))
 }
 
-/// The pixels without row padding.
-fn tight<'a>(h: &FrameHeader, format: PixelFormat, pixels: &'a [u8], repacked: &'a mut Vec<u8>) -> &'a [u8] {
-    let row = format.row_bytes(h.width) as usize;
+/// The pixels of a colour image without row padding.
+fn tight<'a>(h: &FrameHeader, pixels: &'a [u8], repacked: &'a mut Vec<u8>) -> &'a [u8] {
+    let row = 3 * h.width as usize;
     if h.stride as usize == row {
         return pixels;
     }
@@ -264,20 +277,19 @@ fn cannot(h: &FrameHeader, what: &str) -> String {
 fn png(
     out: &mut Vec<u8>,
     h: &FrameHeader,
-    format: PixelFormat,
     pixels: &[u8],
     packing: CompressionType,
     repacked: &mut Vec<u8>,
 ) -> Result<()> {
-    let rgb = if format == PixelFormat::Bgr8 {
+    let rgb = if h.pixel_format() == Some(PixelFormat::Bgr8) {
         repacked.clear();
-        let row = format.row_bytes(h.width) as usize;
+        let row = 3 * h.width as usize;
         for r in pixels.chunks_exact(h.stride as usize) {
             repacked.extend(r[..row].as_chunks::<3>().0.iter().flat_map(|[b, g, r]| [*r, *g, *b]));
         }
         repacked
     } else {
-        tight(h, format, pixels, repacked)
+        tight(h, pixels, repacked)
     };
     let filter = match packing {
         CompressionType::Uncompressed => FilterType::NoFilter,
@@ -293,13 +305,12 @@ fn png(
 fn jpeg(
     out: &mut Vec<u8>,
     h: &FrameHeader,
-    format: PixelFormat,
     pixels: &[u8],
     quality: u8,
     repacked: &mut Vec<u8>,
 ) -> Result<()> {
-    let tight = tight(h, format, pixels, repacked);
-    let color = if format == PixelFormat::Bgr8 { ColorType::Bgr } else { ColorType::Rgb };
+    let tight = tight(h, pixels, repacked);
+    let color = if h.pixel_format() == Some(PixelFormat::Bgr8) { ColorType::Bgr } else { ColorType::Rgb };
     let (Ok(width), Ok(height)) = (u16::try_from(h.width), u16::try_from(h.height)) else {
         return Err(Error::new(ErrorKind::BadInput, "a JPEG has at most 65535 pixels per side"));
     };

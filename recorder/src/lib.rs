@@ -46,6 +46,7 @@ mod slice;
 pub mod still;
 #[cfg(any(test, feature = "testing"))]
 pub mod testing;
+pub mod transit;
 pub mod trigger;
 mod verify;
 

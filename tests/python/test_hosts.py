@@ -11,7 +11,8 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -31,7 +32,8 @@ NAMES = {"here": "right", "there": "left"}
 class Rig:
     """A daemon on each of two computers, and what one says to them."""
 
-    def __init__(self, hosts: TwoHosts, binary: str, folder: Path, runtime: Path) -> None:  # noqa: F811
+    def __init__(self, hosts: TwoHosts, binary: str, folder: Path, runtime: Path, *, mirror: Sequence[str] = (), more: str = "") -> None:  # noqa: F811
+        """The streams `mirror` of the other computer come here; `more` is the end of its rig file."""
         self.hosts = hosts
         self.binary = binary
         self.folder = folder
@@ -42,7 +44,8 @@ class Rig:
         left = self.runtime["there"] / "mount.sock"
         ssh = hosts.serve_ssh()
         links = {
-            "here": f'listen = "10.77.0.1:7447"\n[[link.hosts]]\nname = "left"\nssh = "{ssh}"\nsocket = "{left}"',
+            "here": f'listen = "10.77.0.1:7447"\n[[link.hosts]]\nname = "left"\nssh = "{ssh}"\nsocket = "{left}"\n'
+            f"mirror = {json.dumps(mirror)}",
             "there": 'recorder = "10.77.0.1:7447"',
         }
         for host, name in NAMES.items():
@@ -52,6 +55,7 @@ class Rig:
             for camera in HOST_CAMERAS[host]:
                 manifest = json.dumps(str(ROOT / "tests" / "data" / f"{camera.name}.toml"))
                 lines += ["[[camera]]", f'name = "{camera.name}"', 'backend = "files"', f"manifest = {manifest}"]
+            lines += [more] if host == "there" else []
             self.rig_file(host).write_text("\n".join(lines) + "\n")
 
     def rig_file(self, host: str) -> Path:
@@ -114,16 +118,23 @@ class Rig:
         return self.data("here") / str(wait_for("joined", found))
 
 
-@pytest.fixture
-def rig(binary: str, tmp_path: Path) -> Iterator[Rig]:  # noqa: F811
+@contextmanager
+def two_computers(binary: str, folder: Path, *options: str, **more: Any) -> Iterator[Rig]:  # noqa: F811
+    """Both computers, with `options` of two_hosts.py and `more` of their rig."""
     if why := why_not():
         pytest.skip(why)
     runtime = Path(subprocess.run(["mktemp", "-d", "/tmp/hXXXX"], capture_output=True, text=True, check=True).stdout.strip())
     # The server's user is another one where the tests run as root.
-    for folder in (tmp_path, runtime):
-        os.chmod(folder, 0o700)
-    with TwoHosts(tmp_path, "--shift", str(SHIFT_NS)) as hosts:
-        yield Rig(hosts, binary, tmp_path, runtime)
+    for path in (folder, runtime):
+        os.chmod(path, 0o700)
+    with TwoHosts(folder, "--shift", str(SHIFT_NS), *options) as hosts:
+        yield Rig(hosts, binary, folder, runtime, **more)
+
+
+@pytest.fixture
+def rig(binary: str, tmp_path: Path) -> Iterator[Rig]:  # noqa: F811
+    with two_computers(binary, tmp_path) as rig:
+        yield rig
 
 
 def images(dataset: Path) -> dict[str, list[bytes]]:

@@ -63,6 +63,11 @@ impl<S> Limited<S> {
         Self { stream, timeout, blocked: None }
     }
 
+    /// The stream, without limits.
+    pub(super) fn into_inner(self) -> S {
+        self.stream
+    }
+
     /// `wrote` unless the time is up; `len` bytes were to be written.
     fn judge(
         &mut self,

@@ -8,7 +8,7 @@ use super::reply::Refusal;
 use super::requests::{
     CameraRequest, FingerprintRequest, LoopRequest, NoteRequest, RateRequest, StepRequest,
 };
-use super::{SERVER_HEADER, allowed, guard, limits, live};
+use super::{SERVER_HEADER, allowed, frames, guard, limits, live};
 use crate::control::{
     CalibratedImage, CameraControls, Control, ControlChanges, ControlList, ControlRequest, EpisodeRequest,
     GridRequest, GridStreams, RecordRequest, RecordingEpisodes, ReplayControl, SeekRequest, StopRequest,
@@ -53,10 +53,11 @@ pub struct Route {
 const CALIBRATION_EVENTS: &str = "/v1/calibration/events";
 
 /// Every call of the API.
-pub const ROUTES: [Route; 39] = [
+pub const ROUTES: [Route; 40] = [
     Route { method: "GET", path: "/v1/status", handler: || get(status) },
     Route { method: "GET", path: "/v1/health", handler: || get(health) },
     Route { method: "GET", path: "/v1/config", handler: || get(config) },
+    Route { method: "GET", path: "/v1/frames/{camera}/{stream}", handler: || get(frames::upgrade) },
     Route { method: "GET", path: "/v1/record", handler: || get(record) },
     Route { method: "GET", path: "/v1/record/losses", handler: || get(record_losses) },
     Route { method: "POST", path: "/v1/record/start", handler: || post(record_start) },

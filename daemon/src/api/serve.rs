@@ -6,7 +6,7 @@ use super::live::Live;
 use super::page::PageAddress;
 use super::socket::{self, SocketFile};
 use super::token::{self, Token};
-use super::{MAX_CONNECTIONS, foxglove, guard, routes};
+use super::{MAX_CONNECTIONS, foxglove, frames, guard, routes};
 use crate::config::ControlConfig;
 use crate::control::Control;
 use crate::foxglove::Foxglove;
@@ -81,7 +81,8 @@ impl ServerHandle {
         let signals = SignalFeed::new(runtime_dir.clone());
         let foxglove = Foxglove::new(runtime_dir.clone(), rig.clone(), Arc::clone(&control));
         let address = PageAddress::of(tcp, foxglove_tcp, token.as_deref().map(Token::path));
-        let served = Served { control, viewers, signals, foxglove, address, stopped };
+        let frames = frames::Served { runtime: runtime_dir.clone(), rig: rig.clone() };
+        let served = Served { control, frames, viewers, signals, foxglove, address, stopped };
         let serve = move || {
             runtime.block_on(run(served, listeners));
             // A call that is still under way ends by itself; nobody waits for its answer.
@@ -135,6 +136,7 @@ struct Listeners {
 /// The rig, and what serves it.
 struct Served {
     control: Arc<dyn Control>,
+    frames: frames::Served,
     viewers: Viewers,
     signals: SignalFeed,
     foxglove: Foxglove,
@@ -143,7 +145,7 @@ struct Served {
 }
 
 async fn run(served: Served, listeners: Listeners) {
-    let Served { control, viewers, signals, foxglove, address, stopped } = served;
+    let Served { control, frames, viewers, signals, foxglove, address, stopped } = served;
     let Listeners { unix, port, foxglove: foxglove_port } = listeners;
     let pages = Arc::new(Semaphore::new(MAX_CONNECTIONS));
     let live = |token: Option<Arc<Token>>| {
@@ -159,6 +161,7 @@ async fn run(served: Served, listeners: Listeners) {
     let rig = Arc::clone(&control);
     let router = routes::router(control, Events::new(stopped.clone()))
         .layer(Extension(address))
+        .layer(Extension(frames))
         .layer(axum::middleware::from_fn(guard::own_origin))
         .layer(axum::middleware::from_fn(guard::loopback_host));
     // Connections of the port are anybody's on this computer: they must not take the places of the socket.

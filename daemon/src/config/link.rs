@@ -2,7 +2,7 @@
 
 use super::read::{FromToml, Section};
 use super::{HostConfig, LinkConfig, LinkRole, Reach};
-use depthrig_bus::Name;
+use depthrig_bus::{Name, StreamId};
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
@@ -52,13 +52,29 @@ fn hosts(link: &Section<'_, '_>, own: Option<&Name>, role: Option<LinkRole>) -> 
             s.problem(s.at, what);
         }
         let reach = reach(&s);
+        let mirror = mirror(&s);
         s.finish();
-        match (name, reach) {
-            (Some(name), Some(reach)) => hosts.push(HostConfig { name: name.value, reach }),
+        match (name, reach, mirror) {
+            (Some(name), Some(reach), Some(mirror)) => {
+                hosts.push(HostConfig { name: name.value, reach, mirror })
+            }
             _ => is_good = false,
         }
     }
     is_good.then_some(hosts)
+}
+
+/// Streams whose frames come from there; `None` after a problem was noted.
+fn mirror(s: &Section<'_, '_>) -> Option<Vec<StreamId>> {
+    let Some(streams) = s.get::<Vec<StreamId>>("mirror") else {
+        return (!s.has("mirror")).then(Vec::new);
+    };
+    let twice = streams.value.iter().enumerate().find(|(i, id)| streams.value[..*i].contains(id));
+    if let Some((_, id)) = twice {
+        s.problem(streams.at, format!("mirror names {id} twice"));
+        return None;
+    }
+    Some(streams.value)
 }
 
 fn reach(s: &Section<'_, '_>) -> Option<Reach> {

@@ -342,6 +342,12 @@ macro_rules! integers {
 }
 integers!(u8, u16, u32, u64, usize, i32);
 
+impl FromToml for depthrig_bus::StreamId {
+    fn from_toml(value: &DeValue<'_>) -> Result<Self, String> {
+        String::from_toml(value)?.parse().map_err(|e: depthrig_bus::Error| format!("must name a stream: {e}"))
+    }
+}
+
 impl FromToml for depthrig_bus::Name {
     fn from_toml(value: &DeValue<'_>) -> Result<Self, String> {
         Self::new(String::from_toml(value)?).map_err(|e| format!("is not a valid name: {e}"))

@@ -13,6 +13,8 @@ use crate::recording::{self, Begun};
 use crate::status::{RecordingStatus, RigStatus};
 use crate::{Error, ErrorKind, Result};
 use core::sync::atomic::Ordering;
+use depthrig_bus::HostTime;
+use depthrig_link::Reading;
 use depthrig_recorder::Episode;
 use depthrig_usb::SysRoot;
 use std::path::PathBuf;
@@ -20,6 +22,10 @@ use std::path::PathBuf;
 impl Control for Inner {
     fn status(&self) -> RigStatus {
         report::status(self)
+    }
+
+    fn session_clock(&self, at: HostTime) -> Option<Reading> {
+        self.link.as_ref()?.at(at)
     }
 
     fn config_text(&self) -> String {

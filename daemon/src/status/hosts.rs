@@ -12,10 +12,12 @@ pub struct HostsStatus {
 }
 
 impl HostsStatus {
-    /// Whether a computer is away or refused, or has no part of a recording that goes on.
+    /// Whether a computer is away or refused, has no part of a recording that goes on, or sends no frames of a stream.
     pub fn is_ill(&self) -> bool {
-        self.hosts.iter().any(|host| host.state != HostState::Connected || host.why.is_some())
-            || self.session.as_ref().is_some_and(|s| s.joined == JoinState::Failed)
+        self.hosts.iter().any(|host| {
+            let is_ill = host.state != HostState::Connected || host.why.is_some();
+            is_ill || host.mirrors.iter().any(|mirror| mirror.why.is_some())
+        }) || self.session.as_ref().is_some_and(|s| s.joined == JoinState::Failed)
     }
 }
 
@@ -36,6 +38,37 @@ pub struct HostStatus {
     pub has_clock: bool,
     /// The recording that goes on there.
     pub recording: Option<String>,
+    /// Its streams that subscribers of this computer read.
+    pub mirrors: Vec<MirrorStatus>,
+}
+
+/// A stream of another computer that subscribers of this one read.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct MirrorStatus {
+    /// The stream, `CAMERA/STREAM`.
+    pub stream: String,
+    /// Whether its frames come.
+    pub state: MirrorState,
+    /// Why they do not; `None` while they do, or the computer is away.
+    pub why: Option<String>,
+    /// Coding of the newest frame on the way: `raw`, `jpeg` or `rank`; `None` before the first.
+    pub coding: Option<String>,
+    /// Frames a second, published here.
+    pub rate_hz: f64,
+    /// Frames that were published here.
+    pub frames: u64,
+    /// Frames that were left out, because the way is too slow or was cut.
+    pub skipped: u64,
+}
+
+/// Whether frames of a mirrored stream come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum MirrorState {
+    /// They do.
+    Live,
+    /// They do not.
+    Waiting,
 }
 
 /// Whether the daemon of another computer answers.

@@ -171,6 +171,15 @@ impl Fake {
             }),
             hosts: Some(HostsStatus {
                 hosts: vec![HostStatus {
+                    mirrors: vec![MirrorStatus {
+                        stream: "wrist/color".into(),
+                        state: MirrorState::Live,
+                        why: None,
+                        coding: Some("jpeg".into()),
+                        rate_hz: 29.9,
+                        frames: 900,
+                        skipped: 3,
+                    }],
                     host: "top".into(),
                     state: HostState::Refused,
                     why: Some("its rig is \"other\"".into()),

@@ -111,7 +111,7 @@ fn check_color(kind: &str, width: u32, height: u32, fits: bool, h: &FrameHeader)
 }
 
 /// The payload as the header describes it: same format, same stride, same length.
-pub(super) fn decode(stored: &[u8], codec: Codec, h: &FrameHeader) -> Result<Vec<u8>> {
+pub(crate) fn decode(stored: &[u8], codec: Codec, h: &FrameHeader) -> Result<Vec<u8>> {
     let pixels = match codec {
         Codec::Raw | Codec::Mjpeg => stored.to_vec(),
         Codec::Rank => {

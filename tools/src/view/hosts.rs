@@ -2,11 +2,16 @@
 
 use super::{RED, Style};
 use crate::{out, printable};
-use depthrig_daemon::status::{HostState, HostStatus, HostsStatus, JoinState, PartStatus, SessionStatus};
+use depthrig_daemon::status::{
+    HostState, HostStatus, HostsStatus, JoinState, MirrorState, MirrorStatus, PartStatus, SessionStatus,
+};
 
 /// The lines, without newlines.
 pub(super) fn lines(status: &HostsStatus, style: Style) -> Vec<String> {
-    let hosts = status.hosts.iter().map(|h| host(h, style));
+    let hosts = status.hosts.iter().flat_map(|h| {
+        let mirrors = h.mirrors.iter().map(move |m| mirror(&h.host, m, style));
+        core::iter::once(host(h, style)).chain(mirrors)
+    });
     hosts.chain(status.session.iter().flat_map(|s| session(s, style))).collect()
 }
 
@@ -27,6 +32,17 @@ fn host(host: &HostStatus, style: Style) -> String {
             format!("host    {name}: {cameras}{clock}{recording}{trouble}")
         }
     }
+}
+
+fn mirror(host: &str, mirror: &MirrorStatus, style: Style) -> String {
+    let stream = &mirror.stream;
+    if mirror.state == MirrorState::Waiting {
+        let why = mirror.why.as_deref().map(|why| format!(": {}", style.paint(RED, &printable::line(why))));
+        return format!("mirror  {stream}: waits for {host}{}", why.unwrap_or_default());
+    }
+    let coding = mirror.coding.as_deref().unwrap_or_default();
+    let skipped = if mirror.skipped == 0 { String::new() } else { format!(", {} left out", mirror.skipped) };
+    format!("mirror  {stream}: {:.1} Hz from {host} as {}{skipped}", mirror.rate_hz, printable::line(coding))
 }
 
 fn session(session: &SessionStatus, style: Style) -> Vec<String> {

@@ -1,0 +1,140 @@
+//! Whether frames of a stream come as they are or in a smaller coding: as they are while the way has room for that.
+
+use super::Ask;
+use core::time::Duration;
+use depthrig_bus::HostTime;
+
+/// Share of the time between two frames that an image may travel as it is.
+const FULL: f64 = 0.6;
+/// So many frames above it more than below, and they come small.
+const SLOW_FRAMES: u32 = 3;
+/// Share of that time which an image would have to travel as it is, by what small ones take, for coming as it is again.
+const ROOM: f64 = 0.3;
+/// There must be room for so long; twice as long after each time that it was not true, at most the second.
+const WAITS: [Duration; 2] = [Duration::from_secs(5), Duration::from_mins(1)];
+
+/// How a frame came.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Journey {
+    /// When it was here.
+    pub(super) at: HostTime,
+    /// Bytes of its image on the way.
+    pub(super) bytes: usize,
+    /// Bytes of its image as it is.
+    pub(super) raw_bytes: usize,
+    /// From its first byte to its last.
+    pub(super) took: Duration,
+    /// From one frame of the stream to the next.
+    pub(super) period: Duration,
+}
+
+/// The choice for one stream.
+#[derive(Debug)]
+pub(super) struct Pace {
+    ask: Ask,
+    slow: u32,
+    /// Since when there has been room.
+    since: Option<HostTime>,
+    wait: Duration,
+}
+
+impl Default for Pace {
+    fn default() -> Self {
+        Self { ask: Ask::Raw, slow: 0, since: None, wait: WAITS[0] }
+    }
+}
+
+impl Pace {
+    /// How the next frame shall come.
+    pub(super) const fn ask(&self) -> Ask {
+        self.ask
+    }
+
+    /// Learns from a frame.
+    pub(super) fn learn(&mut self, journey: &Journey) {
+        let per_byte = journey.took.as_secs_f64() / journey.bytes.max(1) as f64;
+        let share = per_byte * journey.raw_bytes as f64 / journey.period.as_secs_f64().max(1e-9);
+        match self.ask {
+            Ask::Raw => {
+                self.slow = if share > FULL { self.slow + 1 } else { self.slow.saturating_sub(1) };
+                if self.slow >= SLOW_FRAMES {
+                    *self = Self { ask: Ask::Small, slow: 0, since: None, wait: self.wait };
+                }
+            }
+            Ask::Small if share > ROOM => self.since = None,
+            Ask::Small => {
+                let since = *self.since.get_or_insert(journey.at);
+                if since.plus(self.wait) <= journey.at {
+                    let wait = (self.wait * 2).min(WAITS[1]);
+                    *self = Self { ask: Ask::Raw, slow: 0, since: None, wait };
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Frames at 30 Hz over a way of so many bytes a second, for so many seconds; how they came.
+    fn travel(pace: &mut Pace, from_s: f64, seconds: f64, rate: f64) -> Vec<Ask> {
+        let raw_bytes = 1_843_200;
+        let frames = (seconds * 30.0) as usize;
+        (0..frames)
+            .map(|i| {
+                let bytes = if pace.ask() == Ask::Raw { raw_bytes } else { raw_bytes / 5 };
+                let at = HostTime::from_ns(((from_s + i as f64 / 30.0) * 1e9) as i64);
+                let took = Duration::from_secs_f64(bytes as f64 / rate);
+                pace.learn(&Journey {
+                    at,
+                    bytes,
+                    raw_bytes,
+                    took,
+                    period: Duration::from_secs_f64(1.0 / 30.0),
+                });
+                pace.ask()
+            })
+            .collect()
+    }
+
+    #[test]
+    fn a_way_with_room_carries_them_as_they_are() {
+        let mut pace = Pace::default();
+        assert!(travel(&mut pace, 0.0, 10.0, 1.2e9).iter().all(|a| *a == Ask::Raw));
+    }
+
+    #[test]
+    fn a_slow_way_is_noticed_at_once_and_a_fast_one_after_some_time() {
+        let mut pace = Pace::default();
+        let asks = travel(&mut pace, 0.0, 10.0, 12e6);
+        assert_eq!(asks.iter().position(|a| *a == Ask::Small), Some(2));
+        assert!(asks[2..].iter().all(|a| *a == Ask::Small), "and it stays");
+        let asks = travel(&mut pace, 10.0, 10.0, 1.2e9);
+        let back = asks.iter().position(|a| *a == Ask::Raw).unwrap();
+        assert!((145..160).contains(&back), "{back}");
+    }
+
+    #[test]
+    fn a_way_that_seems_to_have_room_is_tried_less_and_less_often() {
+        let mut pace = Pace::default();
+        let mut tries = 0;
+        // Small frames pass at once, raw ones do not.
+        for i in 0..30 * 300 {
+            let at = HostTime::from_ns(i * 33_333_333);
+            let took = if pace.ask() == Ask::Raw { 33.0 } else { 0.5 };
+            let bytes = if pace.ask() == Ask::Raw { 1000 } else { 200 };
+            let before = pace.ask();
+            let period = Duration::from_millis(33);
+            pace.learn(&Journey {
+                at,
+                bytes,
+                raw_bytes: 1000,
+                took: Duration::from_secs_f64(took * 1e-3),
+                period,
+            });
+            tries += u32::from(before == Ask::Small && pace.ask() == Ask::Raw);
+        }
+        assert!((5..=9).contains(&tries), "{tries} tries in five minutes");
+    }
+}

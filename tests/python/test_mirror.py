@@ -1,0 +1,171 @@
+"""Live frames of another computer, read by the package depthrig as those of this one: which, when, and what is said while none come.
+
+The two computers have clocks that are apart by a known time, so that each frame's time here has a truth.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import depthrig
+import numpy as np
+import pytest
+from test_daemon import WAIT_S, binary
+from test_hosts import Rig, two_computers, wait_for
+from test_link_clock import SHIFT_NS
+
+__all__ = ["binary"]
+
+STREAMS = ["moving/color", "moving/depth"]
+MOVING = """
+[[camera]]
+name = "moving"
+backend = "synthetic"
+model = "d455"
+cheap = true
+[[camera.stream]]
+name = "color"
+width = 640
+height = 480
+rate_hz = 30.0
+[[camera.stream]]
+name = "depth"
+width = 640
+height = 480
+rate_hz = 30.0
+"""
+
+
+@pytest.fixture
+def rig(binary: str, tmp_path: Path) -> Iterator[Rig]:  # noqa: F811
+    with two_computers(binary, tmp_path, mirror=[*STREAMS, "moving/infra_none"], more=MOVING) as rig:
+        yield rig
+
+
+def mirrors(rig: Rig) -> dict[str, dict[str, Any]]:
+    return {m["stream"]: m for m in rig.host()["mirrors"]}
+
+
+def wait_for_mirror(rig: Rig, stream: str, state: str, seconds: float = WAIT_S, **has: object) -> dict[str, Any]:
+    def found() -> dict[str, Any] | None:
+        mirror = mirrors(rig)[stream]
+        return mirror if mirror["state"] == state and all(mirror[k] == v for k, v in has.items()) else None
+
+    return wait_for(f"{stream} is {state}, {has}", found, seconds)
+
+
+def read(rig: Rig, host: str, stream: str, count: int) -> dict[int, tuple[Any, np.ndarray]]:
+    """Headers and pixels of the next frames, by the camera's own counter."""
+    with depthrig.Stream(stream, "mount", rig.runtime[host], timeout=WAIT_S) as source:
+        frames = {}
+        while len(frames) < count:
+            with source.next(timeout=WAIT_S) as frame:
+                frames[frame.header.device_sequence] = (frame.header, np.array(frame.array))
+        return frames
+
+
+def both(rig: Rig, stream: str, count: int) -> list[tuple[Any, np.ndarray, Any, np.ndarray]]:
+    """Frames that were read on both computers."""
+    out: list[tuple[Any, np.ndarray, Any, np.ndarray]] = []
+    with (
+        depthrig.Stream(stream, "mount", rig.runtime["here"], timeout=WAIT_S) as here,
+        depthrig.Stream(stream, "mount", rig.runtime["there"], timeout=WAIT_S) as there,
+    ):
+        originals: dict[int, tuple[Any, np.ndarray]] = {}
+        deadline = time.monotonic() + WAIT_S
+        while len(out) < count:
+            assert time.monotonic() < deadline, f"{len(out)} frames of {stream} came"
+            with there.next(timeout=WAIT_S) as frame:
+                originals[frame.header.device_sequence] = (frame.header, np.array(frame.array))
+            try:
+                frame = here.next(timeout=0.1)
+            except depthrig.Timeout:
+                continue
+            with frame:
+                original = originals.get(frame.header.device_sequence)
+                if original is not None:
+                    out.append((frame.header, np.array(frame.array), *original))
+    return out
+
+
+def check_headers(rig: Rig, frames: list[tuple[Any, np.ndarray, Any, np.ndarray]]) -> None:
+    for h, _, o, _ in frames:
+        wrong_ns = h.capture_time_ns - (o.capture_time_ns - SHIFT_NS)
+        assert abs(wrong_ns) <= h.capture_uncertainty_ns - o.capture_uncertainty_ns < 5_000_000
+        assert h.captured == h.sequence + sum(h.dropped)
+        assert (h.camera, h.stream, h.serial, h.intrinsics, h.pose) == (o.camera, o.stream, o.serial, o.intrinsics, o.pose)
+        assert h.capture_time_ns < h.publish_time_ns
+
+
+def test_frames_are_here_as_they_are_there(rig: Rig) -> None:
+    rig.start("here")
+    rig.start("there")
+    assert mirrors(rig)["moving/color"]["state"] in ("waiting", "live")
+    wait_for("the clock", lambda: rig.host()["has_clock"])
+    for stream in STREAMS:
+        wait_for_mirror(rig, stream, "live", coding="raw")
+        frames = both(rig, stream, 30)
+        check_headers(rig, frames)
+        assert all(np.array_equal(here, there) for _, here, _, there in frames)
+        assert len({here.tobytes() for _, here, _, _ in frames}) > 20, "the images change"
+    # A stream that nobody has is said to be one, and harms no other.
+    absent = wait_for_mirror(rig, "moving/infra_none", "waiting", why="nobody publishes it there")
+    assert absent["frames"] == 0
+    text = rig.ask("status", codes=(3,))
+    assert "mirror  moving/infra_none: waits for left: nobody publishes it there" in text
+    assert " Hz from left as raw" in text
+    # Readers here are no readers there, and the other way round.
+    assert {"moving/color", "moving/depth"} <= set(depthrig.streams("mount", rig.runtime["here"]))
+
+
+def test_a_cut_wire_and_a_killed_daemon_are_gaps_that_are_counted(rig: Rig) -> None:
+    rig.start("here")
+    rig.start("there")
+    wait_for_mirror(rig, "moving/depth", "live")
+    with depthrig.Stream("moving/depth", "mount", rig.runtime["here"], timeout=WAIT_S) as source:
+
+        def next_header() -> Any:
+            with source.next(timeout=WAIT_S) as frame:
+                return frame.header
+
+        before = next_header()
+        rig.hosts.cut()
+        wait_for_mirror(rig, "moving/depth", "waiting", 10)
+        time.sleep(2)
+        rig.hosts.heal()
+        wait_for_mirror(rig, "moving/depth", "live", 20)
+        time.sleep(0.5)
+        while (after := next_header()).capture_time_ns < before.capture_time_ns + 3e9:
+            pass
+        # The camera's own account, over the gap: all that it captured was published here or is counted.
+        assert after.captured - before.captured == after.device_sequence - before.device_sequence
+        assert after.sequence - before.sequence < after.captured - before.captured - 60
+        assert sum(after.dropped) - sum(before.dropped) == after.captured - before.captured - (after.sequence - before.sequence)
+        rig.kill("there")
+        wait_for_mirror(rig, "moving/depth", "waiting", 10)
+        rig.start("there")
+        again = wait_for("frames of the new daemon", lambda: (h := next_header()).device_sequence < after.device_sequence and h)
+        # The reader goes on with the same stream.
+        assert again.sequence > after.sequence and again.captured == again.sequence + sum(again.dropped)
+
+
+def test_frames_come_small_where_the_way_is_slow(binary: str, tmp_path: Path) -> None:  # noqa: F811
+    with two_computers(binary, tmp_path, "--rate", "100mbit", mirror=STREAMS, more=MOVING) as rig:
+        rig.start("here")
+        rig.start("there")
+        wait_for_mirror(rig, "moving/color", "live", coding="jpeg")
+        wait_for_mirror(rig, "moving/depth", "live", coding="rank")
+        depth = both(rig, "moving/depth", 20)
+        check_headers(rig, depth)
+        assert all(np.array_equal(here, there) for _, here, _, there in depth), "depth is what it was, bit for bit"
+        color = both(rig, "moving/color", 20)
+        check_headers(rig, color)
+        off = [np.abs(here.astype(int) - there).mean() for _, here, _, there in color]
+        assert max(off) < 4, "colour is nearly what it was"
+        # It is late by less than two frames.
+        late = [h.publish_time_ns - h.capture_time_ns for h, *_ in color]
+        assert np.median(late) < 70e6
+        assert mirrors(rig)["moving/color"]["skipped"] > 0
