@@ -27,7 +27,7 @@ struct Place {
 impl Place {
     fn new() -> Self {
         let folder = tempfile::tempdir_in("/tmp").unwrap();
-        let runtime = RuntimeDir::at(folder.path().join("r")).unwrap();
+        let runtime = RuntimeDir::at(&folder.path().join("r")).unwrap();
         let socket = folder.path().join("s");
         Self {
             runtime,

@@ -26,7 +26,7 @@ fn the_recorder_names_the_other_computers() {
         "[[link.hosts]]\nname = \"left\"\nssh = \"lab@10.0.0.2\"\n[[link.hosts]]\nname = \"top\"\nssh = \"top\"\nsocket = \"/run/m.sock\"\n\
          [[link.hosts]]\nname = \"far\"\nsocket = \"/run/far.sock\"",
     );
-    let host = |name: &str, reach| HostConfig { name: name.parse().unwrap(), reach };
+    let host = |name: &str, reach| HostConfig { name: name.parse().unwrap(), reach, mirror: Vec::new() };
     let ssh = |to: &str, socket: Option<&str>| Reach::Ssh {
         destination: to.to_owned(),
         socket: socket.map(Into::into),
