@@ -119,7 +119,7 @@ def _rgb_image(frame: Frame) -> Image.Image:
     """Return colour or grey as Pillow's image, RGB or L."""
     kind, array = frame.header.pixel_format, frame.array
     if kind is PixelFormat.MJPEG:
-        return Image.open(io.BytesIO(array)).convert("RGB")
+        return Image.open(io.BytesIO(array.tobytes())).convert("RGB")
     if kind in (PixelFormat.RGB8, PixelFormat.MONO8):
         return Image.fromarray(np.ascontiguousarray(array))
     if kind is PixelFormat.BGR8:
@@ -138,4 +138,5 @@ def _rgb(luma: npt.NDArray[Any], chroma: npt.NDArray[Any]) -> npt.NDArray[np.uin
     y = 1.164 * (luma.astype(np.float32) - 16)
     u, v = (chroma[:, :, i].astype(np.float32) - 128 for i in (0, 1))
     rgb = np.stack((y + 1.596 * v, y - 0.392 * u - 0.813 * v, y + 2.017 * u), axis=2)
-    return np.rint(np.clip(rgb, 0, 255)).astype(np.uint8)
+    pixels: npt.NDArray[np.uint8] = np.rint(np.clip(rgb, 0, 255)).astype(np.uint8)
+    return pixels

@@ -61,7 +61,8 @@ def published_types(token: str) -> tuple[str, str] | None:
 
 def identity(token: str) -> bytes:
     """Return the 16 bytes that identify an endpoint in the attachments of its messages: a hash of its token."""
-    return xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
+    digest: int = xxhash.xxh3_128_intdigest(token.encode())
+    return digest.to_bytes(16, "little")
 
 
 def attachment(sequence: int, utc_ns: int, gid: bytes) -> bytes:

@@ -56,13 +56,13 @@ class SignalFeed(Feed):
         self.publishers.append(publisher)
         while not self.stopped:
             if publisher.wanted:
-                with _Samples(self.name, self._folder) as reader:
+                with contextlib.closing(_Samples(self.name, self._folder)) as reader:
                     self._publish(reader, publisher)
             else:
                 self.wait_for_change()
 
     def _describe(self) -> SignalDescription | None:
-        with _Samples(self.name, self._folder) as reader:
+        with contextlib.closing(_Samples(self.name, self._folder)) as reader:
             while not self.stopped:
                 for sample in reader.take():
                     return sample.description
