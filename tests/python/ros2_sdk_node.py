@@ -17,6 +17,7 @@ definitions = json.load(sys.stdin)
 pairs = list(zip(rest[::2], rest[1::2], strict=True))
 done = {topic: threading.Event() for topic, _ in pairs}
 counts = dict.fromkeys(done, 0)
+whole_lines = threading.Lock()
 
 
 def printed(topic):
@@ -37,7 +38,8 @@ def printed(topic):
             about["position"] = [float(v) for v in message.position]
         if hasattr(message, "linear_acceleration"):
             about["accel"] = message.linear_acceleration.z
-        print(json.dumps(about), flush=True)
+        with whole_lines:
+            print(json.dumps(about), flush=True)
         done[topic].set()
 
     return came

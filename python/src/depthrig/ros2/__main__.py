@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import gc
 import json
 import logging
 import os
@@ -12,7 +14,7 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from .._runtime import runtime_dir as default_runtime_dir
 from ..errors import DepthrigError
@@ -59,7 +61,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (DepthrigError, ValueError, _session.ConfigError) as e:
         log.error("%s", e)
         return 1
+    except BrokenPipeError:
+        log.error("nobody reads the status any more")
+        return 1
     return 0
+
+
+def run() -> NoReturn:
+    """Run the program and end the process."""
+    code = main()
+    gc.collect()  # the place on the bus goes with the last object that uses it
+    logging.shutdown()
+    with contextlib.suppress(BrokenPipeError):
+        sys.stdout.flush()
+    # A thread of zenoh that waits for the interpreter would end the process with SIGABRT when the interpreter ends.
+    os._exit(code)
 
 
 class _Report:
@@ -124,4 +140,4 @@ def _topic(text: str) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run()

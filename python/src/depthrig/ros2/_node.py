@@ -78,6 +78,7 @@ class Publisher:
         self._sequence = 0
         self._wanted = qos is Qos.LATCHED
         self._publisher: Any
+        self._listener: Any = None
         # rmw_zenoh blocks only for "reliable, keep all", which none of these is.
         options: dict[str, Any] = {"congestion_control": zenoh.CongestionControl.DROP}
         if ros_type not in (_types.IMAGE, _types.COMPRESSED, _types.POINTS):
@@ -95,7 +96,7 @@ class Publisher:
             )
         else:
             self._publisher = node.session.declare_publisher(node.key(topic, ros_type), **options)
-            self._publisher.declare_matching_listener(self._matched)
+            self._listener = self._publisher.declare_matching_listener(self._matched)
             self._wanted |= self._publisher.matching_status.matching
         self._token, text = node.announce("MP", topic, ros_type, qos)
         self._gid = _names.identity(text)
@@ -120,4 +121,6 @@ class Publisher:
         """Take back the token and stop publishing."""
         self._wanted = False
         self._token.undeclare()
+        if self._listener is not None:
+            self._listener.undeclare()
         self._publisher.undeclare()
