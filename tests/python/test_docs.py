@@ -115,7 +115,7 @@ def test_every_command_in_the_documents_exists(binary: str) -> None:
         for line in shell(path):
             for part in re.split(r"\s*(?:&&|\|\|?|;)\s*", line):
                 part = part.removeprefix("sudo ")
-                if not re.match(r"depthrig\b|\"\$\(command -v depthrig\)\"", part):
+                if not re.match(r"depthrig(?![\w-])|\"\$\(command -v depthrig\)\"", part):
                     continue
                 check(root, shlex.split(part)[1:], f"{path.name}: {line}")
                 seen += 1
