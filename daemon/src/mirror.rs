@@ -70,6 +70,16 @@ enum Head {
 }
 
 impl Head {
+    /// Why no frame follows.
+    const fn why(self) -> &'static str {
+        match self {
+            Self::Frame(..) => "a frame follows",
+            Self::Quiet => "its camera sends no frames there",
+            Self::Absent => "nobody publishes it there",
+            Self::NoClock => "the clock of the session is not known there yet",
+        }
+    }
+
     fn bytes(self) -> [u8; HEAD_BYTES] {
         let mut bytes = [0; HEAD_BYTES];
         bytes[0] = match self {

@@ -56,7 +56,7 @@ fn hosts(link: &Section<'_, '_>, own: Option<&Name>, role: Option<LinkRole>) -> 
         s.finish();
         match (name, reach, mirror) {
             (Some(name), Some(reach), Some(mirror)) => {
-                hosts.push(HostConfig { name: name.value, reach, mirror })
+                hosts.push(HostConfig { name: name.value, reach, mirror });
             }
             _ => is_good = false,
         }

@@ -15,7 +15,7 @@ const LOOK: Duration = Duration::from_millis(50);
 /// A peer that reads nothing for so long has gone.
 const STALLED: Duration = Duration::from_secs(20);
 
-/// What is to be answered.
+/// The question and who asks it.
 pub(crate) struct Answering {
     /// The connection, blocking.
     pub(crate) peer: UnixStream,

@@ -117,16 +117,8 @@ impl Stream<'_> {
             let begun = HostTime::now();
             let (coding, len) = match Head::from_bytes(head)? {
                 Head::Frame(coding, len) => (coding, len),
-                Head::Quiet => {
-                    self.mirror.wait(Some("its camera sends no frames there".to_owned()));
-                    continue;
-                }
-                Head::Absent => {
-                    self.mirror.wait(Some("nobody publishes it there".to_owned()));
-                    continue;
-                }
-                Head::NoClock => {
-                    self.mirror.wait(Some("the clock of the session is not known there yet".to_owned()));
+                none => {
+                    self.mirror.wait(Some(none.why().to_owned()));
                     continue;
                 }
             };
@@ -161,14 +153,14 @@ impl Stream<'_> {
                 transit::arrived(coding, &header, &small, slot.pixels_mut()).map_err(io::Error::other)?;
             }
             if let Some(slot) = slot {
-                self.publish(slot, header)?;
+                self.publish(slot, &header)?;
             }
             self.note(coding, &mut counted);
         }
         Ok(())
     }
 
-    /// Refuses a frame that is none of this stream, or contradicts itself.
+    /// Refuses a frame of another stream, and one that contradicts itself.
     fn check(&self, h: &FrameHeader, coding: Coding, len: u32) -> io::Result<()> {
         let wrong = |what: String| Err(io::Error::new(io::ErrorKind::InvalidData, what));
         if !h.is_valid() {
@@ -219,8 +211,8 @@ impl Stream<'_> {
         }
     }
 
-    fn publish(&mut self, mut slot: FrameMut, header: FrameHeader) -> io::Result<()> {
-        *slot.header_mut() = header;
+    fn publish(&mut self, mut slot: FrameMut, header: &FrameHeader) -> io::Result<()> {
+        *slot.header_mut() = *header;
         self.numbers.number(slot.header_mut());
         let Some((publisher, _)) = &self.publisher else { return Ok(()) };
         publisher.send(slot).map(drop).map_err(io::Error::other)

@@ -6,9 +6,9 @@ use depthrig_daemon::control::{
 };
 use depthrig_daemon::status::{
     CameraState, CameraStatus, ClockStatus, HostState, HostStatus, HostsStatus, JoinState, LinkState,
-    LinkStatus, PartStatus, PreparingStatus, RecordingStatus, RefineState, RefineStatus, ReplayStatus,
-    RigStatus, SessionStatus, SetAccount, SetStatus, SharedMemoryStatus, SignalState, SignalStatus,
-    StreamStatus,
+    LinkStatus, MirrorState, MirrorStatus, PartStatus, PreparingStatus, RecordingStatus, RefineState,
+    RefineStatus, ReplayStatus, RigStatus, SessionStatus, SetAccount, SetStatus, SharedMemoryStatus,
+    SignalState, SignalStatus, StreamStatus,
 };
 use depthrig_daemon::{Error, ErrorKind, Result};
 use depthrig_recorder::{Episode, EpisodeOutcome};

@@ -24,6 +24,7 @@ fn the_recorder_names_the_other_computers() {
     let read = |hosts: &str| parse(&with(&format!("host = \"right\"\nlisten = \"127.0.0.1:7447\"\n{hosts}")));
     let hosts = read(
         "[[link.hosts]]\nname = \"left\"\nssh = \"lab@10.0.0.2\"\n[[link.hosts]]\nname = \"top\"\nssh = \"top\"\nsocket = \"/run/m.sock\"\n\
+         mirror = [\"wrist/color\", \"wrist/depth\"]\n\
          [[link.hosts]]\nname = \"far\"\nsocket = \"/run/far.sock\"",
     );
     let host = |name: &str, reach| HostConfig { name: name.parse().unwrap(), reach, mirror: Vec::new() };
@@ -31,9 +32,10 @@ fn the_recorder_names_the_other_computers() {
         destination: to.to_owned(),
         socket: socket.map(Into::into),
     };
+    let mirror = ["wrist/color", "wrist/depth"].map(|id| id.parse().unwrap()).into();
     let expected = [
         host("left", ssh("lab@10.0.0.2", None)),
-        host("top", ssh("top", Some("/run/m.sock"))),
+        HostConfig { mirror, ..host("top", ssh("top", Some("/run/m.sock"))) },
         host("far", Reach::Socket("/run/far.sock".into())),
     ];
     assert_eq!(hosts.unwrap().link.unwrap().hosts, expected);
@@ -48,6 +50,8 @@ fn the_recorder_names_the_other_computers() {
             "[[link.hosts]]\nname = \"a\"\nsh = \"b\"\nssh = \"b\"",
             "unknown key \"sh\" in [[link.hosts]] \"a\"",
         ),
+        ("[[link.hosts]]\nname = \"a\"\nssh = \"b\"\nmirror = [\"a/b\", \"a/b\"]", "mirror names a/b twice"),
+        ("[[link.hosts]]\nname = \"a\"\nssh = \"b\"\nmirror = [\"top\"]", "mirror must name a stream"),
         ("hosts = [\"left\"]", "must be written as tables, each headed [[link.hosts]]"),
     ] {
         let found = problems(&with(&format!("host = \"right\"\nlisten = \"127.0.0.1:7447\"\n{text}")));
