@@ -202,6 +202,12 @@ fn every_answer_of_a_live_server_fits_the_document() {
     }
     check("GET", "/v1/recordings/image", &served.get("/v1/recordings/image?name=x"), 409);
     check("GET", "/v1/recordings/image", &served.get("/v1/recordings/image"), 400);
+    // A connection that has changed its protocol has left HTTP; daemon/src/mirror has tests of it.
+    let frames = "/v1/frames/{camera}/{stream}";
+    check("GET", frames, &served.get("/v1/frames/top/color"), 400);
+    check("GET", frames, &served.get("/v1/frames/top/Color%20"), 400);
+    let over_port = served.on_port(&request("GET", "/v1/frames/top/color", "localhost", None, ""));
+    check("GET", frames, &over_port, 403);
     check("GET", "/v1/report/{ticket}", &served.get("/v1/report/0123"), 404);
     for (path, body) in WITHOUT_CAMERAS {
         check("POST", path, &served.post(path, body), 409);
