@@ -41,7 +41,7 @@ rate_hz = 30.0
 
 @pytest.fixture
 def rig(binary: str, tmp_path: Path) -> Iterator[Rig]:  # noqa: F811
-    with two_computers(binary, tmp_path, mirror=[*STREAMS, "moving/infra_none"], more=MOVING) as rig:
+    with two_computers(binary, tmp_path, "--rate", "10gbit", mirror=[*STREAMS, "moving/infra_none"], more=MOVING) as rig:
         yield rig
 
 
@@ -106,9 +106,13 @@ def test_frames_are_here_as_they_are_there(rig: Rig) -> None:
     assert mirrors(rig)["moving/color"]["state"] in ("waiting", "live")
     wait_for("the clock", lambda: rig.host()["has_clock"])
     for stream in STREAMS:
-        wait_for_mirror(rig, stream, "live", coding="raw")
-        frames = both(rig, stream, 30)
-        check_headers(rig, frames)
+        # A computer that is busy carries them small for some seconds.
+        for _ in range(5):
+            wait_for_mirror(rig, stream, "live", coding="raw")
+            frames = both(rig, stream, 30)
+            check_headers(rig, frames)
+            if mirrors(rig)[stream]["coding"] == "raw":
+                break
         assert all(np.array_equal(here, there) for _, here, _, there in frames)
         assert len({here.tobytes() for _, here, _, _ in frames}) > 20, "the images change"
     # A stream that nobody has is said to be one, and harms no other.
