@@ -14,8 +14,8 @@
 #![recursion_limit = "256"] // one JSON object with 42 fields
 
 use depthrig_bus::{
-    Bus, ClockDomain, Distortion, FrameFlags, FrameHeader, HEADER_SIZE, HostTime, Intrinsics, MemberRecord,
-    PixelFormat, Pose, Publisher, RigName, RuntimeDir, SetHeader, StreamId,
+    Bus, ClockDomain, Distortion, FrameFlags, FrameHeader, HostTime, Intrinsics, MemberRecord, PixelFormat,
+    Pose, Publisher, RigName, RuntimeDir, SetHeader, StreamId,
 };
 use std::error::Error;
 use std::io::BufRead;
@@ -240,10 +240,7 @@ fn text(s: &str) -> [u8; 32] {
 /// Writes `header.bin` and `header.json` into `folder`.
 fn dump(folder: &Path) -> Result<(), Box<dyn Error>> {
     let h = distinct();
-    #[allow(unsafe_code)]
-    // SAFETY: `FrameHeader` is `#[repr(C)]` plain data without padding (the bus tests that its fields cover every
-    // byte), and `h` lives until the bytes are written.
-    let bytes = unsafe { core::slice::from_raw_parts((&raw const h).cast::<u8>(), HEADER_SIZE) };
+    let bytes = h.to_bytes();
     // Each field by its name, not from the table of offsets that the mirrors are generated from.
     let json = serde_json::json!({
         "magic": h.magic, "version": h.version, "size": h.size, "sequence": h.sequence,

@@ -30,7 +30,7 @@ pub(crate) const PROTOCOL: &str = "depthrig-frames/1";
 /// Bytes before the header of a frame.
 const HEAD_BYTES: usize = 8;
 
-/// How the next frame shall come.
+/// A question for the next frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Ask {
     /// As it lies in shared memory.

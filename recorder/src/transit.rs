@@ -66,20 +66,24 @@ impl Default for TransitEncoder {
 }
 
 impl TransitEncoder {
-    /// Puts the image of `h` in its smaller coding into `out`, whose contents are replaced; returns that coding.
+    /// Puts the image of `h` in its smaller coding into `out`, whose contents are replaced; returns that coding, and nothing in `out` if it is
+    /// [`Coding::Raw`].
     ///
     /// # Errors
     /// [`ErrorKind::BadInput`] for pixels that contradict the header, [`ErrorKind::Codec`] when they cannot be encoded.
     pub fn encode(&mut self, h: &FrameHeader, pixels: &[u8], out: &mut Vec<u8>) -> Result<Coding> {
         let coding = Coding::smaller(check_image(h, pixels.len())?);
         out.clear();
+        if coding == Coding::Raw {
+            return Ok(coding);
+        }
         let pixels = &pixels[..h.payload_len as usize];
         self.writer.encode(out, coding.codec(), h, pixels, CompressionType::Fast)?;
         Ok(coding)
     }
 }
 
-/// Whether an image of `h` may come in this coding as `len` bytes.
+/// Refuses an image of `h` that may not come in this coding as `len` bytes.
 ///
 /// # Errors
 /// [`ErrorKind::BadInput`] for a header that contradicts itself or them.
@@ -140,6 +144,10 @@ mod tests {
             let mut bytes = vec![1, 2, 3];
             assert_eq!(encoder.encode(&h, &pixels, &mut bytes).unwrap(), coding, "{format:?}");
             let mut back = vec![0; pixels.len()];
+            if coding == Coding::Raw {
+                assert!(bytes.is_empty());
+                bytes.clone_from(&pixels);
+            }
             arrived(coding, &h, &bytes, &mut back).unwrap();
             let off = pixels.iter().zip(&back).map(|(a, b)| a.abs_diff(*b)).max().unwrap();
             assert!(off <= most, "{format:?} is off by {off}");

@@ -57,16 +57,6 @@ def wait_for_mirror(rig: Rig, stream: str, state: str, seconds: float = WAIT_S, 
     return wait_for(f"{stream} is {state}, {has}", found, seconds)
 
 
-def read(rig: Rig, host: str, stream: str, count: int) -> dict[int, tuple[Any, np.ndarray]]:
-    """Headers and pixels of the next frames, by the camera's own counter."""
-    with depthrig.Stream(stream, "mount", rig.runtime[host], timeout=WAIT_S) as source:
-        frames = {}
-        while len(frames) < count:
-            with source.next(timeout=WAIT_S) as frame:
-                frames[frame.header.device_sequence] = (frame.header, np.array(frame.array))
-        return frames
-
-
 def both(rig: Rig, stream: str, count: int) -> list[tuple[Any, np.ndarray, Any, np.ndarray]]:
     """Frames that were read on both computers."""
     out: list[tuple[Any, np.ndarray, Any, np.ndarray]] = []

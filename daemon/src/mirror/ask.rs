@@ -127,7 +127,6 @@ impl Stream<'_> {
             let header = FrameHeader::from_bytes(&bytes);
             self.check(&header, coding, len)?;
             let is_last = self.numbers.is_last(&header);
-            let period_ns = if is_last { None } else { self.numbers.came(&header) };
             let slot = if is_last { None } else { self.slot(&header)? };
             let raw_bytes = header.payload_len as usize;
             let mut slot = match slot {
@@ -141,6 +140,11 @@ impl Stream<'_> {
                     slot
                 }
             };
+            // Only now: of a frame that is cut off the next one says that it is missing.
+            let period_ns = if is_last { None } else { self.numbers.came(&header) };
+            if slot.is_none() && !is_last {
+                self.numbers.lost(DropReason::NoSlot);
+            }
             if let Some(period_ns) = period_ns.and_then(|ns| u64::try_from(ns).ok()) {
                 let at = HostTime::now();
                 let took = Duration::from_nanos(at.since_ns(begun).unsigned_abs());
@@ -150,7 +154,10 @@ impl Stream<'_> {
             if let Some(slot) = &mut slot
                 && coding != Coding::Raw
             {
-                transit::arrived(coding, &header, &small, slot.pixels_mut()).map_err(io::Error::other)?;
+                transit::arrived(coding, &header, &small, slot.pixels_mut()).map_err(|e| {
+                    self.numbers.lost(DropReason::WrongSize);
+                    io::Error::other(e)
+                })?;
             }
             if let Some(slot) = slot {
                 self.publish(slot, &header)?;
@@ -189,7 +196,7 @@ impl Stream<'_> {
         transit::check(coding, h, len).map_err(io::Error::other)
     }
 
-    /// A slot for its image; `None` if subscribers hold all, which is counted.
+    /// A slot for its image; `None` if subscribers hold all.
     fn slot(&mut self, h: &FrameHeader) -> io::Result<Option<FrameMut>> {
         let len = h.payload_len as usize;
         if self.publisher.as_ref().is_none_or(|(_, room)| *room < len) {
@@ -203,10 +210,7 @@ impl Stream<'_> {
         let Some((publisher, _)) = &self.publisher else { return Ok(None) };
         match publisher.loan(len) {
             Ok(slot) => Ok(Some(slot)),
-            Err(e) if e.kind() == ErrorKind::NoSpace => {
-                self.numbers.lost(DropReason::NoSlot);
-                Ok(None)
-            }
+            Err(e) if e.kind() == ErrorKind::NoSpace => Ok(None),
             Err(e) => Err(io::Error::other(e)),
         }
     }

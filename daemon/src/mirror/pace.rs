@@ -13,7 +13,7 @@ const ROOM: f64 = 0.3;
 /// There must be room for so long; twice as long after each time that it was not true, at most the second.
 const WAITS: [Duration; 2] = [Duration::from_secs(5), Duration::from_mins(1)];
 
-/// How a frame came.
+/// A frame's way from the other computer.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Journey {
     /// When it was here.
@@ -45,7 +45,7 @@ impl Default for Pace {
 }
 
 impl Pace {
-    /// How the next frame shall come.
+    /// The question for the next frame.
     pub(super) const fn ask(&self) -> Ask {
         self.ask
     }

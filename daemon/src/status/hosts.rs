@@ -61,7 +61,7 @@ pub struct MirrorStatus {
     pub skipped: u64,
 }
 
-/// Whether frames of a mirrored stream come.
+/// State of a mirrored stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum MirrorState {
