@@ -131,7 +131,7 @@ impl<H: Header> Channel<H> {
             let port = self.publisher(&service, max_bytes, slots)?;
             let Some(lack) = shm::back(port.id().value(), slots)? else {
                 let loans = self.form.loans;
-                return Ok(Outlet { port, loans, slots, what: self.what.clone() });
+                return Ok(Outlet { port, service, loans, slots, what: self.what.clone() });
             };
             // Its memory is free again before the next one is tried.
             drop(port);
@@ -336,6 +336,11 @@ impl<H: Header> Sender<H> {
         self.out.welcome();
     }
 
+    /// Subscribers of the channel, those included that have yet to be connected.
+    pub fn subscribers(&self) -> usize {
+        self.out.service.dynamic_config().number_of_subscribers()
+    }
+
     /// Slots of shared memory that the channel has.
     pub const fn slots(&self) -> usize {
         self.out.slots
@@ -371,6 +376,7 @@ pub fn sleep(listener: &Listener<IoxService>, timeout: Duration, what: &str) -> 
 #[derive(Debug)]
 pub struct Outlet<H: Header> {
     port: Publisher<IoxService, [u8], H>,
+    service: Factory<H>,
     loans: usize,
     slots: usize,
     what: String,

@@ -39,6 +39,11 @@ impl Publisher {
         self.sender.welcome();
     }
 
+    /// Subscribers of the stream, those included that have read nothing yet. One that was killed counts until its remains are removed.
+    pub fn subscribers(&self) -> usize {
+        self.sender.subscribers()
+    }
+
     /// Publishes `frame`, stamping its publish time; returns how many subscribers it went to.
     ///
     /// # Errors

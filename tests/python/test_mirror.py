@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,15 @@ def wait_for_mirror(rig: Rig, stream: str, state: str, seconds: float = WAIT_S, 
     return wait_for(f"{stream} is {state}, {has}", found, seconds)
 
 
+@contextmanager
+def read(rig: Rig) -> Iterator[None]:
+    """What is read here is asked for: a subscriber of each stream, whose frames are left unread."""
+    with ExitStack() as stack:
+        for stream in STREAMS:
+            stack.enter_context(depthrig.Stream(stream, "mount", rig.runtime["here"], timeout=WAIT_S))
+        yield
+
+
 def both(rig: Rig, stream: str, count: int) -> list[tuple[Any, np.ndarray, Any, np.ndarray]]:
     """Frames that were read on both computers."""
     out: list[tuple[Any, np.ndarray, Any, np.ndarray]] = []
@@ -93,33 +103,59 @@ def check_headers(rig: Rig, frames: list[tuple[Any, np.ndarray, Any, np.ndarray]
 def test_frames_are_here_as_they_are_there(rig: Rig) -> None:
     rig.start("here")
     rig.start("there")
-    assert mirrors(rig)["moving/color"]["state"] in ("waiting", "live")
+    assert mirrors(rig)["moving/color"]["state"] in ("waiting", "live", "unread")
     wait_for("the clock", lambda: rig.host()["has_clock"])
     for stream in STREAMS:
-        # A computer that is busy carries them small for some seconds.
-        for _ in range(5):
-            wait_for_mirror(rig, stream, "live", coding="raw")
-            frames = both(rig, stream, 30)
-            check_headers(rig, frames)
-            if mirrors(rig)[stream]["coding"] == "raw":
-                break
+        with read(rig):
+            # A computer that is busy carries them small for some seconds.
+            for _ in range(5):
+                wait_for_mirror(rig, stream, "live", coding="raw")
+                frames = both(rig, stream, 30)
+                check_headers(rig, frames)
+                if mirrors(rig)[stream]["coding"] == "raw":
+                    break
+            text = rig.ask("status", codes=(3,))
         assert all(np.array_equal(here, there) for _, here, _, there in frames)
         assert len({here.tobytes() for _, here, _, _ in frames}) > 20, "the images change"
     # A stream that nobody has is said to be one, and harms no other.
     absent = wait_for_mirror(rig, "moving/infra_none", "waiting", why="nobody publishes it there")
     assert absent["frames"] == 0
-    text = rig.ask("status", codes=(3,))
     assert "mirror  moving/infra_none: waits for left: nobody publishes it there" in text
     assert " Hz from left as raw" in text
     # Readers here are no readers there, and the other way round.
     assert {"moving/color", "moving/depth"} <= set(depthrig.streams("mount", rig.runtime["here"]))
+    nobody_reads(rig)
+
+
+def nobody_reads(rig: Rig) -> None:
+    """A stream without a reader is not carried; its next reader gets no frame of before, and loses none."""
+
+    def carried() -> int:
+        (line,) = [line for line in rig.hosts.run("here", "cat", "/proc/net/dev").splitlines() if "here:" in line]
+        return int(line.split()[1])
+
+    unread = {stream: wait_for_mirror(rig, stream, "unread", 10) for stream in STREAMS}
+    assert "mirror  moving/color: nobody here reads it" in rig.ask("status", codes=(3,))
+    before = carried()
+    time.sleep(2)
+    # Of 41 MB/s; the clock, and what asks for the state of the other computer, go on.
+    assert carried() - before < 500_000
+    left_s = time.clock_gettime(time.CLOCK_MONOTONIC)
+    for stream in STREAMS:
+        assert mirrors(rig)[stream] == unread[stream], "no frame came"
+        with depthrig.Stream(stream, "mount", rig.runtime["here"], timeout=WAIT_S) as source, source.next(timeout=WAIT_S) as frame:
+            h = frame.header
+            assert h.capture_time_ns / 1e9 > left_s, "a frame of before"
+            assert h.sequence == unread[stream]["frames"] + 1
+            assert h.captured == h.sequence + sum(h.dropped)
+            assert h.dropped[depthrig.DropReason.QUEUE_FULL] == unread[stream]["skipped"]
 
 
 def test_a_cut_wire_and_a_killed_daemon_are_gaps_that_are_counted(rig: Rig) -> None:
     rig.start("here")
     rig.start("there")
-    wait_for_mirror(rig, "moving/depth", "live")
     with depthrig.Stream("moving/depth", "mount", rig.runtime["here"], timeout=WAIT_S) as source:
+        wait_for_mirror(rig, "moving/depth", "live")
 
         def next_header() -> Any:
             with source.next(timeout=WAIT_S) as frame:
@@ -150,16 +186,21 @@ def test_frames_come_small_where_the_way_is_slow(binary: str, tmp_path: Path) ->
     with two_computers(binary, tmp_path, "--rate", "100mbit", mirror=STREAMS, more=MOVING) as rig:
         rig.start("here")
         rig.start("there")
-        wait_for_mirror(rig, "moving/color", "live", coding="jpeg")
-        wait_for_mirror(rig, "moving/depth", "live", coding="rank")
-        depth = both(rig, "moving/depth", 20)
-        check_headers(rig, depth)
-        assert all(np.array_equal(here, there) for _, here, _, there in depth), "depth is what it was, bit for bit"
-        color = both(rig, "moving/color", 20)
-        check_headers(rig, color)
-        off = [np.abs(here.astype(int) - there).mean() for _, here, _, there in color]
-        assert max(off) < 4, "colour is nearly what it was"
-        # It is late by less than two frames.
-        late = [h.publish_time_ns - h.capture_time_ns for h, *_ in color]
-        assert np.median(late) < 70e6
-        assert mirrors(rig)["moving/color"]["skipped"] > 0
+        with read(rig):
+            check_small(rig)
+
+
+def check_small(rig: Rig) -> None:
+    wait_for_mirror(rig, "moving/color", "live", coding="jpeg")
+    wait_for_mirror(rig, "moving/depth", "live", coding="rank")
+    depth = both(rig, "moving/depth", 20)
+    check_headers(rig, depth)
+    assert all(np.array_equal(here, there) for _, here, _, there in depth), "depth is what it was, bit for bit"
+    color = both(rig, "moving/color", 20)
+    check_headers(rig, color)
+    off = [np.abs(here.astype(int) - there).mean() for _, here, _, there in color]
+    assert max(off) < 4, "colour is nearly what it was"
+    # It is late by less than two frames.
+    late = [h.publish_time_ns - h.capture_time_ns for h, *_ in color]
+    assert np.median(late) < 70e6
+    assert mirrors(rig)["moving/color"]["skipped"] > 0

@@ -26,6 +26,8 @@ const MAX_IMAGE_BYTES: u32 = 128 << 20;
 const SILENCE: Duration = Duration::from_secs(2);
 /// From one look at the end of the rig to the next.
 const LOOK: Duration = Duration::from_millis(100);
+/// From one look for a subscriber to the next, while there is none.
+const UNREAD: Duration = Duration::from_millis(10);
 /// The pause before a lost connection is made again.
 const PAUSE: Duration = Duration::from_millis(300);
 /// Rates are counted over so long.
@@ -77,9 +79,9 @@ impl Mirror {
                     tracing::warn!("stream {} is not mirrored: {now}", self.id);
                 }
                 why.clone_from(&now);
-                self.wait(Some(now).filter(|why| !why.is_empty()));
+                self.rest(MirrorState::Waiting, Some(now).filter(|why| !why.is_empty()));
             } else {
-                self.wait(None);
+                self.rest(MirrorState::Waiting, None);
             }
             std::thread::sleep(PAUSE);
         }
@@ -87,9 +89,9 @@ impl Mirror {
     }
 
     /// Writes down that no frames come.
-    fn wait(&self, why: Option<String>) {
+    fn rest(&self, state: MirrorState, why: Option<String>) {
         let mut seen = lock(&self.seen);
-        (seen.state, seen.why, seen.rate_hz) = (MirrorState::Waiting, why, 0.0);
+        (seen.state, seen.why, seen.rate_hz) = (state, why, 0.0);
     }
 }
 
@@ -111,6 +113,10 @@ impl Stream<'_> {
         let mut small = Vec::new();
         let mut counted = (HostTime::now(), self.numbers.published());
         while is_there() && !stop.load(Ordering::Relaxed) {
+            if self.is_unread()? {
+                std::thread::sleep(UNREAD);
+                continue;
+            }
             peer.write_all(&[pace.ask().byte()])?;
             let mut head = [0; HEAD_BYTES];
             read(&mut peer, &mut head)?;
@@ -118,7 +124,7 @@ impl Stream<'_> {
             let (coding, len) = match Head::from_bytes(head)? {
                 Head::Frame(coding, len) => (coding, len),
                 none => {
-                    self.mirror.wait(Some(none.why().to_owned()));
+                    self.mirror.rest(MirrorState::Waiting, Some(none.why().to_owned()));
                     continue;
                 }
             };
@@ -167,6 +173,28 @@ impl Stream<'_> {
         Ok(())
     }
 
+    /// Whether nobody here reads the stream. It stays on the bus for the next subscriber, which gets no frame of before: the publisher is another
+    /// one, because each keeps its last frame for those that come late.
+    fn is_unread(&mut self) -> io::Result<bool> {
+        let Some((publisher, room)) = &self.publisher else { return Ok(false) };
+        let is_unread = publisher.subscribers() == 0;
+        if is_unread && self.mirror.status().state != MirrorState::Unread {
+            let room = *room;
+            self.publisher = None;
+            self.publish_with(room)?;
+            self.numbers.rest();
+            self.mirror.rest(MirrorState::Unread, None);
+        }
+        Ok(is_unread)
+    }
+
+    /// Makes the stream's channel, for images of `room` bytes at most.
+    fn publish_with(&mut self, room: usize) -> io::Result<()> {
+        let publisher = self.bus.publisher(&self.mirror.id, room, SLOTS).map_err(io::Error::other)?;
+        self.publisher = Some((publisher, room));
+        Ok(())
+    }
+
     /// Refuses a frame of another stream, and one that contradicts itself.
     fn check(&self, h: &FrameHeader, coding: Coding, len: u32) -> io::Result<()> {
         let wrong = |what: String| Err(io::Error::new(io::ErrorKind::InvalidData, what));
@@ -204,8 +232,7 @@ impl Stream<'_> {
             // JPEG images of a camera differ in length; none is as long as its pixels.
             let pixels = 3 * h.width as usize * h.height as usize;
             let room = if h.pixel_format() == Some(PixelFormat::Mjpeg) { len.max(pixels) } else { len };
-            let publisher = self.bus.publisher(&self.mirror.id, room, SLOTS).map_err(io::Error::other)?;
-            self.publisher = Some((publisher, room));
+            self.publish_with(room)?;
         }
         let Some((publisher, _)) = &self.publisher else { return Ok(None) };
         match publisher.loan(len) {

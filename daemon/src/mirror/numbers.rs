@@ -32,6 +32,11 @@ impl Numbers {
         Some(between / i64::try_from(steps).unwrap_or(i64::MAX))
     }
 
+    /// Nobody reads: what comes from now on until the next frame is not lost.
+    pub(super) const fn rest(&mut self) {
+        self.before = None;
+    }
+
     /// It could not be published.
     pub(super) fn lost(&mut self, reason: DropReason) {
         self.dropped.add(reason, 1);
@@ -123,6 +128,9 @@ mod tests {
         assert_eq!(numbers.came(&frame(8, 190)), Some(30));
         assert_eq!(numbers.skipped(), 2);
         assert_eq!(numbers.came(&frame(1, 300)), None, "it started anew");
+        assert_eq!(numbers.skipped(), 2);
+        numbers.rest();
+        assert_eq!(numbers.came(&frame(90, 3000)), None, "nobody read the frames between");
         assert_eq!(numbers.skipped(), 2);
     }
 }

@@ -67,6 +67,8 @@ pub struct MirrorStatus {
 pub enum MirrorState {
     /// They do.
     Live,
+    /// Nobody here reads the stream, so none is asked for.
+    Unread,
     /// They do not.
     Waiting,
 }

@@ -102,7 +102,7 @@ fn serve(mut session: Session<'_>, behaviour: &str, frames: u64) {
             let header = slot.header_mut();
             match behaviour {
                 "other_size" => (header.width, header.height) = (640, 480),
-                "one_lie" if n == 15 => header.format = 0xBAD,
+                "single_lies" if n % 64 == 15 => header.format = 0xBAD,
                 "says_more" if n.is_multiple_of(3) => header.payload_len = u32::MAX,
                 "strange_numbers" => {
                     header.gain = f32::NAN;

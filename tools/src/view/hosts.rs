@@ -40,6 +40,9 @@ fn mirror(host: &str, mirror: &MirrorStatus, style: Style) -> String {
         let why = mirror.why.as_deref().map(|why| format!(": {}", style.paint(RED, &printable::line(why))));
         return format!("mirror  {stream}: waits for {host}{}", why.unwrap_or_default());
     }
+    if mirror.state == MirrorState::Unread {
+        return format!("mirror  {stream}: nobody here reads it");
+    }
     let coding = mirror.coding.as_deref().unwrap_or_default();
     let skipped = if mirror.skipped == 0 { String::new() } else { format!(", {} left out", mirror.skipped) };
     format!("mirror  {stream}: {:.1} Hz from {host} as {}{skipped}", mirror.rate_hz, printable::line(coding))
