@@ -145,7 +145,8 @@ step rust-small "$runner" "$built" "${small[@]}" --nofile 64 --only depthrig-bus
     --skip a_dead_process_whose_description_is_gone --skip sixteen_subscribers_find_room
 step rust-busy "$runner" "$built" "${small[@]}" --nofile 256 --only depthrig-tests:dataset --only depthrig-tests:replay
 
-step daemon box -- "${tests[@]}" tests/python
+# Two files at a time, which wait more than they compute; a test that depends on the load says so and has room for it.
+step daemon box -- "${tests[@]}" --numprocesses 2 --dist loadfile tests/python
 step page box -- node --test tests/page/
 step page-types box -- tests/readers/node_modules/.bin/tsc --project tests/page
 step page-lint box -- tests/readers/node_modules/.bin/oxlint --config tests/page/oxlint.json daemon/page tests/page

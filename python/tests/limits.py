@@ -102,7 +102,8 @@ def pytest_runtest_teardown() -> Iterator[None]:
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
     """Names a skipped test in the file of `DEPTHRIG_TEST_SKIPS`."""
     path = os.environ.get("DEPTHRIG_TEST_SKIPS")
-    if report.skipped and path:
+    # A process of pytest-xdist reports to another one, which comes here too.
+    if report.skipped and path and "PYTEST_XDIST_WORKER" not in os.environ:
         why = str(report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longrepr)
         with open(path, "a") as file:
             file.write(f"{report.nodeid}: {why}\n")

@@ -26,7 +26,7 @@ const MAX_IMAGE_BYTES: u32 = 128 << 20;
 const SILENCE: Duration = Duration::from_secs(2);
 /// From one look at the end of the rig to the next.
 const LOOK: Duration = Duration::from_millis(100);
-/// From one look for a subscriber to the next, while there is none.
+/// From one look for a subscriber to the next.
 const UNREAD: Duration = Duration::from_millis(10);
 /// The pause before a lost connection is made again.
 const PAUSE: Duration = Duration::from_millis(300);

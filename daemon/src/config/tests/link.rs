@@ -51,7 +51,10 @@ fn the_recorder_names_the_other_computers() {
             "unknown key \"sh\" in [[link.hosts]] \"a\"",
         ),
         ("[[link.hosts]]\nname = \"a\"\nssh = \"b\"\nmirror = [\"a/b\", \"a/b\"]", "mirror names a/b twice"),
-        ("[[link.hosts]]\nname = \"a\"\nssh = \"b\"\nmirror = [\"top\"]", "\"mirror\" in [[link.hosts]] \"a\" value 1 must name a stream"),
+        (
+            "[[link.hosts]]\nname = \"a\"\nssh = \"b\"\nmirror = [\"top\"]",
+            "\"mirror\" in [[link.hosts]] \"a\" value 1 must name a stream",
+        ),
         ("hosts = [\"left\"]", "must be written as tables, each headed [[link.hosts]]"),
     ] {
         let found = problems(&with(&format!("host = \"right\"\nlisten = \"127.0.0.1:7447\"\n{text}")));
