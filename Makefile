@@ -26,7 +26,7 @@ REFERENCE := .venv-reference
 DOCS := .venv-docs
 REQUIREMENTS := python/requirements-test.txt tests/python/requirements-s3.txt $(READERS)/requirements.txt tests/page_browser/requirements.txt tests/terminal/requirements.txt
 
-.PHONY: help demo demo-two-hosts demo-calibration lab-demo train-tiny noise-models reference environments test check-debian13 test-long vm fuzz lint docs dist test-dist bench bench-page bench-peers bench-feed clean setup-build setup-test setup-vm setup-peers setup-fuzz setup-dist
+.PHONY: help demo demo-two-hosts demo-calibration lab-demo train-tiny noise-models reference environments test check-debian13 test-long vm fuzz lint docs dist test-dist bench bench-page bench-mirror bench-peers bench-feed clean setup-build setup-test setup-vm setup-peers setup-fuzz setup-dist
 
 help: ## show this list
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -110,6 +110,10 @@ bench: setup-build ## the numbers of docs/performance.md
 bench-page: setup-test $(VENV)/.stamp ## what the live page costs the rig that it shows
 	cargo build --release --package depthrig
 	$(VENV)/bin/python tests/page_cost.py target/release/depthrig $(ARGS)
+
+bench-mirror: setup-test $(VENV)/.stamp ## what live frames of another computer cost, beside zenoh
+	cargo build --release --package depthrig
+	$(VENV)/bin/python tests/link/mirror_cost.py target/release/depthrig $(ARGS)
 
 bench-peers: setup-peers $(PEERS_VENV)/.stamp ## compare with Python mcap, foxglove-sdk, rosbag and PNG files, in one run
 	cargo build --release --package depthrig-recorder --example bench_frames

@@ -2,17 +2,25 @@
 
     tests/link/demo.py DEPTHRIG [--seconds S] [--cut S] [--rate 1gbit] [--keep DIR]
 
-Prints what was recorded, lost, pulled and joined, and ends with 1 if anything is missing. `tools/demo-two-hosts.sh` builds depthrig first.
+Prints what was recorded, lost, pulled and joined, how right the clocks were, how late live frames of the other computer are, and which of these is what
+docs/two-computers.md promises. Ends with 1 if anything is missing. `tools/demo-two-hosts.sh` builds depthrig first.
 """
 
 from __future__ import annotations
 
 import argparse
+import http.client
 import json
+import re
 import shutil
+import socket
+import statistics
 import sys
 import tempfile
+import threading
 import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from hosts import TwoHosts, wait_for, why_not
@@ -21,6 +29,65 @@ from hosts import TwoHosts, wait_for, why_not
 SHIFT_NS = 1_234_567_890_123
 HERE_CAMERAS = 4
 RENDER_S = 600.0
+MIRRORED = "l515/depth"
+MIRROR_FRAMES = 90
+# Of a clock reading, seconds: from one to the next, and what the digits of a status leave out.
+CLOCK_PERIOD_S = 0.1
+DIGITS_S = 1e-9
+
+
+class ControlSocket(http.client.HTTPConnection):
+    """HTTP to a daemon."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__("localhost", timeout=10)
+        self.path = path
+
+    def connect(self) -> None:
+        self.sock = socket.socket(socket.AF_UNIX)
+        self.sock.settimeout(10)
+        self.sock.connect(str(self.path))
+
+
+class Clock:
+    """How far the clock of the session is off on the other computer, whose true offset is known, while this is open."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.readings: list[tuple[float, float]] = []
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._read, daemon=True)
+
+    def __enter__(self) -> Clock:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join(20)
+
+    def _read(self) -> None:
+        while not self._stop.wait(CLOCK_PERIOD_S):
+            connection = ControlSocket(self.path)
+            try:
+                connection.request("GET", "/v1/status")
+                link = json.loads(connection.getresponse().read())["link"]
+            except OSError:
+                continue
+            finally:
+                connection.close()
+            self.readings.append(((link["offset_s"] + SHIFT_NS / 1e9) * 1e6, link["uncertainty_us"]))
+
+    def row(self) -> tuple[str, str, str, bool]:
+        errors = sorted(abs(error) for error, _ in self.readings)
+        outside = sum(abs(error) > uncertainty + DIGITS_S * 1e6 for error, uncertainty in self.readings)
+        p99 = errors[int(0.99 * (len(errors) - 1))]
+        said = f"p50 {statistics.median(errors):.1f}, p99 {p99:.1f} us; {outside} of {len(errors)} outside of the stated uncertainty"
+        return "error of the clock", said, "p99 50 us; 0", p99 <= 50 and outside == 0
+
+
+# What was measured, its value, what was promised, and whether that is so.
+Row = tuple[str, str, str, bool]
 
 
 class Side:
@@ -56,7 +123,7 @@ def split(config: str, right: Side, left: Side, ssh: str) -> None:
     top, *cameras = config.split("\n[[camera]]")
     lines = [line for line in top.splitlines() if line and not line.startswith("#")]
     link = {
-        right.name: f'listen = "10.77.0.1:7447"\n[[link.hosts]]\nname = "{left.name}"\nssh = "{ssh}"\nsocket = "{left.runtime}/mount.sock"',
+        right.name: f'listen = "10.77.0.1:7447"\n[[link.hosts]]\nname = "{left.name}"\nssh = "{ssh}"\nsocket = "{left.runtime}/mount.sock"\nmirror = ["{MIRRORED}"]',
         left.name: 'recorder = "10.77.0.1:7447"',
     }
     parts = {right.name: cameras[:HERE_CAMERAS], left.name: cameras[HERE_CAMERAS:]}
@@ -102,6 +169,34 @@ def main() -> int:
             shutil.rmtree(folder, ignore_errors=True)
 
 
+def cut_wire(hosts: TwoHosts, seconds: float, link: Callable[[], dict]) -> list[Row]:
+    """Cuts the wire for so long: when that is seen, and when the other computer is back."""
+    begun = time.monotonic()
+    hosts.cut()
+    seen_s = float("inf")
+    while time.monotonic() < begun + seconds:
+        if seen_s == float("inf") and link()["state"] == "absent":
+            seen_s = time.monotonic() - begun
+        time.sleep(0.05)
+    hosts.heal()
+    healed = time.monotonic()
+    # A connection that the cut has ended is missed a little later.
+    time.sleep(0.2)
+    wait_for("the wire is back", lambda: link()["state"] == "connected")
+    return [(f"wire cut for {healed - begun:.1f} s", f"seen after {seen_s:.1f} s, back {time.monotonic() - healed:.1f} s after it was whole", "", True)]
+
+
+def mirrored(right: Side, left: Side) -> list[Row]:
+    """How late live frames of the other computer are, beside the same stream there."""
+    latency = re.compile(r"latency ([\d.]+) ms")
+    tap = ("tap", MIRRORED, "--count", str(MIRROR_FRAMES))
+    with ThreadPoolExecutor(2) as pool:
+        here, there = pool.map(lambda side: [float(ms) for ms in latency.findall(side.ask(*tap))], (right, left))
+    added = statistics.median(here) - statistics.median(there)
+    said = f"{len(here)} frames of {MIRRORED}, p50 {added:+.1f} ms"
+    return [("added by mirroring", said, "25 ms", added <= 25)]
+
+
 def session(hosts: TwoHosts, options: argparse.Namespace, folder: Path, runtime: Path) -> int:
     right = Side(hosts, options.binary, "here", "right", folder, runtime)
     left = Side(hosts, options.binary, "there", "left", folder, runtime)
@@ -112,28 +207,13 @@ def session(hosts: TwoHosts, options: argparse.Namespace, folder: Path, runtime:
     wait_for("the cameras", lambda: right.is_ready() and left.is_ready(), RENDER_S)
     link = lambda: right.status()["hosts"]["hosts"][0]  # noqa: E731
     wait_for("the other computer", lambda: link()["has_clock"])
-    clock = left.status()["link"]
-    error_us = (clock["offset_s"] * 1e9 + SHIFT_NS) / 1e3
-    print(f"clock: {clock['offset_s']:+.6f} s within {clock['uncertainty_us']:.0f} us; truth is {error_us:+.1f} us away", flush=True)
-
     print(right.ask("record", "start", "--name", "demo", "--scene", "table"), end="", flush=True)
-    time.sleep((options.seconds - options.cut) / 2)
-    if options.cut > 0:
+    with Clock(left.runtime / "mount.sock") as seen_clock:
         begun = time.monotonic()
-        hosts.cut()
-        seen = "not seen"
-        while time.monotonic() < begun + options.cut:
-            if seen == "not seen" and link()["state"] == "absent":
-                seen = f"seen after {time.monotonic() - begun:.1f} s"
-            time.sleep(0.05)
-        hosts.heal()
-        healed = time.monotonic()
-        # A connection that the cut has ended is missed a little later.
-        time.sleep(0.2)
-        wait_for("the wire is back", lambda: link()["state"] == "connected")
-        back_s = time.monotonic() - healed
-        print(f"wire cut for {healed - begun:.1f} s: {seen}, back {back_s:.1f} s after it was whole", flush=True)
-    time.sleep((options.seconds - options.cut) / 2)
+        mirror = mirrored(right, left)
+        time.sleep(max(0.0, (options.seconds - options.cut) / 2 - (time.monotonic() - begun)))
+        cut = cut_wire(hosts, options.cut, link) if options.cut > 0 else []
+        time.sleep((options.seconds - options.cut) / 2)
     print(right.ask("record", "stop", codes=(0, 3)), end="", flush=True)
     begun = time.monotonic()
     parts = lambda: right.status()["hosts"]["session"]["parts"]  # noqa: E731
@@ -147,7 +227,25 @@ def session(hosts: TwoHosts, options: argparse.Namespace, folder: Path, runtime:
     print(f"\n  {'dataset':14} {'streams':>7} {'sets':>5} {'complete':>9} {'frames':>7} {'p50 ms':>8} {'max ms':>8} {'MB':>9}")
     for name, title in (("demo", "right's part"), ("demo_left", "left's part"), ("demo_joined", "joined")):
         print(row(title, info[name]))
-    print(f"  pulled {pulled_s:.1f} s and joined {joined_s:.1f} s after the end of {options.seconds:.0f} s\n", flush=True)
+    spreads = {name: of["spread"]["max_ns"] / 1e6 for name, of in info.items()}
+    one_host = max(spreads["demo"], spreads["demo_left"])
+    frames = {name: sum(stream["frames"] for stream in of["streams"]) for name, of in info.items()}
+    missing = frames["demo"] + frames["demo_left"] - frames["demo_joined"]
+    incomplete = info["demo_joined"]["incomplete_sets"]
+    table = [
+        ("frames of the parts that are missing", str(missing), "0", missing == 0),
+        ("incomplete sets", str(incomplete), "0", incomplete == 0),
+        ("widest set, joined", f"{spreads['demo_joined']:.1f} ms", f"{one_host + 1:.1f} ms (one computer's + 1)", spreads["demo_joined"] <= one_host + 1),
+        seen_clock.row(),
+        *mirror,
+        *cut,
+        ("after the end", f"pulled within {pulled_s:.1f} s, joined within {joined_s:.1f} s", "", True),
+    ]
+    print()
+    for name, value, bar, is_met in table:
+        said = f" (promised: {bar}; {'met' if is_met else 'MISSED'})" if bar else ""
+        print(f"  {name:38} {value}{said}", flush=True)
+    print()
     findings = json.loads(right.ask("verify", "--json", str(right.data / "demo_joined"), codes=(0, 1, 3)))["findings"]
     for finding in findings:
         print(f"  {finding['severity']}: {finding['message']}")
@@ -155,8 +253,7 @@ def session(hosts: TwoHosts, options: argparse.Namespace, folder: Path, runtime:
     apart = runtime / "replay"
     apart.mkdir(mode=0o700)
     print(right.ask("replay", str(right.data / "demo_joined"), "--as-fast-as-possible", "-q", "--runtime-dir", str(apart)), end="")
-    frames = {name: sum(stream["frames"] for stream in of["streams"]) for name, of in info.items()}
-    if frames["demo"] + frames["demo_left"] != frames["demo_joined"]:
+    if missing != 0:
         print("frames are missing in the joined dataset", file=sys.stderr)
         return 1
     return 1 if any(finding["severity"] == "broken" for finding in findings) else 0

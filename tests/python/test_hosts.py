@@ -6,6 +6,7 @@ import filecmp
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -67,10 +68,12 @@ class Rig:
     def log(self, host: str) -> str:
         return (self.folder / f"{host}.log").read_text()
 
-    def start(self, host: str) -> None:
+    def start(self, host: str, within: Sequence[str] = ()) -> None:
+        """Starts the daemon of a host, by the command `within`."""
         self.daemons[host] = self.hosts.start(
             host,
             self.folder / f"{host}.log",
+            *within,
             self.binary,
             "run",
             str(self.rig_file(host)),
@@ -112,7 +115,7 @@ class Rig:
 
         def found() -> str | None:
             session = self.session()
-            assert session["joined"] != "failed", session
+            assert session["joined"] != "failed", session["why"]
             return session["dataset"]
 
         return self.data("here") / str(wait_for("joined", found))
@@ -307,6 +310,44 @@ def test_a_host_that_comes_late_gets_its_part_then(rig: Rig) -> None:
     time.sleep(3)
     rig.ask("record", "stop")
     check_joined(rig, rig.joined(), rig.data("here") / "late", [rig.data("here") / "late_left"])
+
+
+def test_a_full_disk_of_the_recorder_delays_the_copy_and_loses_nothing(rig: Rig) -> None:
+    disk = rig.data("here")
+    disk.mkdir()
+    small = f'mount -t tmpfs -o size=256m small "{disk}" && exec "$@"'
+    rig.start("here", ["unshare", "-m", "sh", "-c", small, "sh"])
+    rig.start("there")
+    # What only the daemon sees.
+    seen = Path(f"/proc/{rig.daemons['here'].pid}/root{disk}")
+    room = os.statvfs(seen)
+    assert room.f_blocks * room.f_frsize == 256 << 20
+    rig.ask("record", "start", "--name", "full")
+    free = room.f_bavail * room.f_frsize
+    # Of 64 MB that stay free for recordings, enough for this one.
+    (seen / "other").write_bytes(bytes(free - 66_000_000))
+    time.sleep(3)
+
+    def part() -> dict[str, Any]:
+        (part,) = rig.session()["parts"]
+        return part
+
+    why = wait_for("the reason", lambda: part()["why"], 10)
+    assert "MB free, which recordings of this computer need" in str(why)
+    assert f"{why}"[:40] in rig.ask("status", codes=(0, 3))
+    assert rig.status()["recording"]["active"] and rig.status("there")["recording"]["active"]
+    rig.ask("record", "stop", codes=(0, 3))
+    time.sleep(1)
+    assert not part()["is_complete"]
+    (seen / "other").unlink()
+    wait_for("the part", lambda: part()["is_complete"])
+    # It would leave too little to record with, so that it is left to whoever makes room.
+    wait_for("word of it", lambda: rig.session()["joined"] == "failed")
+    assert "are needed to join the parts and to record after that; make room, then call depthrig merge --hosts" in rig.session()["why"]
+    shutil.copytree(seen, disk, dirs_exist_ok=True)
+    joined = disk / "full_joined"
+    rig.ask("merge", "--hosts", str(joined), str(disk / "full"))
+    check_joined(rig, joined, disk / "full", [disk / "full_left"])
 
 
 def test_a_copy_that_was_damaged_is_pulled_again(rig: Rig) -> None:
