@@ -78,7 +78,7 @@ pub struct RigConfig {
 }
 
 /// The part of this computer in a rig of several computers.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct LinkConfig {
     /// Name of this computer, unique in the rig.
     pub host: Name,
@@ -89,7 +89,7 @@ pub struct LinkConfig {
 }
 
 /// Another computer of the rig, as the one that records reaches it.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct HostConfig {
     /// Its name in the rig.
     pub name: Name,
@@ -97,6 +97,19 @@ pub struct HostConfig {
     pub reach: Reach,
     /// Its streams that subscribers of this computer read.
     pub mirror: Vec<StreamId>,
+    /// How this computer refines the depth of its mirrored cameras; `None`: not at all.
+    pub refine: Option<RefineConfig>,
+}
+
+impl HostConfig {
+    /// Cameras whose colour and `depth` are mirrored.
+    pub fn refined_cameras(&self, depth: &str) -> Vec<CameraName> {
+        let has = |camera: &CameraName, stream: &str| {
+            self.mirror.iter().any(|id| id.camera == *camera && id.stream.as_str() == stream)
+        };
+        let of_color = self.mirror.iter().filter(|id| id.stream.as_str() == "color");
+        of_color.map(|id| &id.camera).filter(|camera| has(camera, depth)).cloned().collect()
+    }
 }
 
 /// The way to the control socket of another daemon.

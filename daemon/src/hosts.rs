@@ -15,6 +15,7 @@
 //! later, whoever was killed or cut off meanwhile.
 
 mod pull;
+mod refine;
 mod session;
 #[cfg(test)]
 mod tests;
@@ -27,6 +28,7 @@ use crate::mirror::Mirror;
 use crate::recording::reserve_bytes;
 use crate::sets::Grid;
 use crate::status::{CameraState, HostState, HostStatus, HostsStatus, JoinState, RecordingStatus, RigStatus};
+use crate::wake::Wake;
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::sync::lock;
@@ -34,6 +36,8 @@ use depthrig_bus::{HostTime, RigName, RuntimeDir};
 use depthrig_link::{Remote, Tunnel};
 use depthrig_recorder::fs::RealFs;
 use depthrig_recorder::{Health, SESSION_FILE, look_at};
+use refine::HostRefine;
+pub use refine::Place;
 use session::{Session, Sessions};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -88,12 +92,24 @@ struct Host {
     cameras: Mutex<Vec<String>>,
     /// Its streams that come here.
     mirrors: Vec<Mirror>,
+    /// Its cameras whose depth is refined here.
+    refined: Vec<HostRefine>,
 }
 
 impl Host {
     fn status(&self) -> HostStatus {
         let mirrors = self.mirrors.iter().map(Mirror::status).collect();
-        HostStatus { mirrors, ..lock(&self.seen).clone() }
+        let refined = self.refined.iter().map(HostRefine::status).collect();
+        HostStatus { mirrors, refined, ..lock(&self.seen).clone() }
+    }
+
+    /// Gives its cameras to the stage that refines depth.
+    fn begin_refined(&self, status: &RigStatus, place: Place<'_>) {
+        for refine in &self.refined {
+            if let Err(e) = refine.begin(status, place) {
+                tracing::error!("host {}: no refined depth: {e}", self.config.name);
+            }
+        }
     }
 
     fn is_connected(&self) -> bool {
@@ -133,6 +149,7 @@ impl Hosts {
             has_clock: false,
             recording: None,
             mirrors: Vec::new(),
+            refined: Vec::new(),
         };
         let mirrors = |h: &HostConfig| {
             let socket = runtime.host_socket_path(&config.rig, &h.name);
@@ -145,6 +162,7 @@ impl Hosts {
                     seen: Mutex::new(seen(h)),
                     cameras: Mutex::default(),
                     mirrors: mirrors(h),
+                    refined: HostRefine::of(h),
                 })
                 .collect(),
             sessions: Mutex::new(Sessions::left_in(&config.recording.directory)),
@@ -207,11 +225,22 @@ impl Hosts {
         }
     }
 
-    /// Keeps host `number` in step until `stop`. `active` is the folder that is being recorded into here.
+    /// Whether depth of any host is refined here.
+    pub fn has_refined(&self) -> bool {
+        self.others.iter().any(|host| !host.refined.is_empty())
+    }
+
+    /// Keeps host `number` in step until `stop`. `active` is the folder that is being recorded into here; its depth is refined at `place`.
     ///
     /// # Errors
     /// When no client or tunnel can be made.
-    pub fn keep(&self, number: usize, active: &dyn Fn() -> Option<PathBuf>, stop: &AtomicBool) -> Result<()> {
+    pub fn keep(
+        &self,
+        number: usize,
+        active: &dyn Fn() -> Option<PathBuf>,
+        place: Place<'_>,
+        stop: &AtomicBool,
+    ) -> Result<()> {
         let Some(host) = self.others.get(number) else { return Ok(()) };
         let client = Client::of_host(&self.runtime, &self.rig, &host.config.name)?;
         let tunnel = self.tunnel(host)?;
@@ -227,6 +256,11 @@ impl Hosts {
                 _ => false,
             };
             self.share_grid(host, &client);
+            if let Ok(status) = &looked
+                && host.is_connected()
+            {
+                host.begin_refined(status, place);
+            }
             if is_new {
                 self.changed.notify_all();
             }
@@ -243,15 +277,15 @@ impl Hosts {
         self.others.iter().map(|host| host.mirrors.len()).sum()
     }
 
-    /// Publishes the frames of mirrored stream `number` here until `stop`.
+    /// Publishes the frames of mirrored stream `number` here until `stop`, and raises `wake` for each.
     ///
     /// # Errors
     /// When this rig's bus cannot be opened.
-    pub fn mirror(&self, number: usize, stop: &AtomicBool) -> Result<()> {
+    pub fn mirror(&self, number: usize, wake: &Wake, stop: &AtomicBool) -> Result<()> {
         let mut all =
             self.others.iter().flat_map(|host| host.mirrors.iter().map(move |mirror| (host, mirror)));
         let Some((host, mirror)) = all.nth(number) else { return Ok(()) };
-        mirror.run(&|| host.is_connected(), stop)
+        mirror.run(&|| host.is_connected(), wake, stop)
     }
 
     /// Says where the ticks lie, and hears of the streams there.

@@ -25,7 +25,7 @@ use crate::camera::{Camera, Shared};
 use crate::config::RigConfig;
 use crate::control::{Control, Shows};
 use crate::family::Preparation;
-use crate::hosts::{Hosts, JoinParts};
+use crate::hosts::{Hosts, JoinParts, Place};
 use crate::link::Link;
 use crate::recording::{Outside, Recording, Reports, recover_left};
 use crate::sets::{Grid, SpreadStats};
@@ -249,7 +249,8 @@ impl Rig {
         }
         let inner = Arc::clone(&rig.inner);
         rig.spawn("supervisor", move |stop| supervise(&inner, stop))?;
-        if rig.inner.config.cameras.iter().any(|c| c.refine.is_some()) {
+        let has_refined = rig.inner.hosts.as_ref().is_some_and(|hosts| hosts.has_refined());
+        if has_refined || rig.inner.config.cameras.iter().any(|c| c.refine.is_some()) {
             let config = &rig.inner.config;
             let shared = &rig.inner.shared;
             let intake = Arc::clone(&shared.stage);
@@ -376,7 +377,8 @@ impl Rig {
             let inner = Arc::clone(&self.inner);
             let hosts = Arc::clone(&hosts);
             self.spawn("host", move |stop| {
-                let kept = hosts.keep(number, &|| inner.recording().active_path(), stop);
+                let place = Place { bus: &inner.shared.bus, intake: &inner.shared.stage };
+                let kept = hosts.keep(number, &|| inner.recording().active_path(), place, stop);
                 if let Err(e) = kept {
                     tracing::error!("{e}");
                 }
@@ -384,8 +386,9 @@ impl Rig {
         }
         for number in 0..hosts.mirrored() {
             let hosts = Arc::clone(&hosts);
+            let wake = Arc::clone(&self.inner.shared.stage.wake);
             self.spawn("mirror", move |stop| {
-                if let Err(e) = hosts.mirror(number, stop) {
+                if let Err(e) = hosts.mirror(number, &wake, stop) {
                     tracing::error!("{e}");
                 }
             })?;

@@ -3,7 +3,7 @@
 mod hosts;
 
 pub use hosts::{
-    HostState, HostStatus, HostsStatus, JoinState, MirrorState, MirrorStatus, PartStatus, SessionStatus,
+    HostRefineStatus, HostState, HostStatus, HostsStatus, JoinState, MirrorState, MirrorStatus, PartStatus, SessionStatus,
 };
 
 use depthrig_recorder::Episode;

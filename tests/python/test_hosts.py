@@ -33,8 +33,8 @@ NAMES = {"here": "right", "there": "left"}
 class Rig:
     """A daemon on each of two computers, and what one says to them."""
 
-    def __init__(self, hosts: TwoHosts, binary: str, folder: Path, runtime: Path, *, mirror: Sequence[str] = (), more: str = "") -> None:  # noqa: F811
-        """The streams `mirror` of the other computer come here; `more` is the end of its rig file."""
+    def __init__(self, hosts: TwoHosts, binary: str, folder: Path, runtime: Path, *, mirror: Sequence[str] = (), refine: str = "", more: str = "") -> None:  # noqa: F811
+        """The streams `mirror` of the other computer come here, where `refine` is what else is said of it; `more` is the end of its rig file."""
         self.hosts = hosts
         self.binary = binary
         self.folder = folder
@@ -46,7 +46,7 @@ class Rig:
         ssh = hosts.serve_ssh()
         links = {
             "here": f'listen = "10.77.0.1:7447"\n[[link.hosts]]\nname = "left"\nssh = "{ssh}"\nsocket = "{left}"\n'
-            f"mirror = {json.dumps(mirror)}",
+            f"mirror = {json.dumps(mirror)}\n{refine}",
             "there": 'recorder = "10.77.0.1:7447"',
         }
         for host, name in NAMES.items():

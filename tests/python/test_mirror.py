@@ -5,6 +5,7 @@ The two computers have clocks that are apart by a known time, so that each frame
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -205,3 +206,49 @@ def check_small(rig: Rig) -> None:
     late = [h.publish_time_ns - h.capture_time_ns for h, *_ in color]
     assert np.median(late) < 70e6
     assert mirrors(rig)["moving/color"]["skipped"] > 0
+
+
+def test_depth_of_the_other_computer_is_refined_here_as_it_would_be_there(binary: str, tmp_path: Path) -> None:  # noqa: F811
+    refine = '[link.hosts.refine]\nengine = "fill"\n'
+    more = MOVING + '[camera.refine]\nengine = "fill"\n'
+    with two_computers(binary, tmp_path, "--rate", "10gbit", mirror=STREAMS, refine=refine, more=more) as rig:
+        rig.start("here")
+        assert rig.host()["refined"] == [{"camera": "moving", "refine": None}]
+        assert "refined   moving: waits for its color and depth" in rig.ask("status", codes=(3,))
+        rig.start("there")
+
+        def state() -> Any:
+            (refined,) = rig.host()["refined"]
+            return refined["refine"] and refined["refine"]["state"] == "running" and refined["refine"]
+
+        assert wait_for("the refiner", state)["engine"] == "fill"
+        # The same code on other computers' images: all that differs is the way, and it carries them as they are.
+        for _ in range(5):
+            wait_for_mirror(rig, "moving/color", "live", coding="raw")
+            wait_for_mirror(rig, "moving/depth", "live", coding="raw")
+            frames = both(rig, "moving/depth_refined", 20)
+            if all(m["coding"] == "raw" for m in mirrors(rig).values()):
+                break
+        check_headers(rig, frames)
+        for h, pixels, o, original in frames:
+            assert (h.refiner, h.width, h.height) == (o.refiner, o.width, o.height)
+            assert abs(h.source_color_capture_time_ns - (o.source_color_capture_time_ns - SHIFT_NS)) < 5_000_000
+            assert np.array_equal(pixels, original)
+        with depthrig.Stream("moving/depth", "mount", rig.runtime["here"], timeout=WAIT_S) as source, source.next(timeout=WAIT_S) as raw:
+            assert (raw.array == 0).sum() > (frames[-1][1] == 0).sum(), "holes are filled"
+        assert re.search(r"refined   moving: running, fill, .* Hz", rig.ask("status", codes=(0, 3)))
+        # Another daemon there, and the stream goes on.
+        with depthrig.Stream("moving/depth_refined", "mount", rig.runtime["here"], timeout=WAIT_S) as source:
+            with source.next(timeout=WAIT_S) as frame:
+                before = frame.header
+            rig.kill("there")
+            rig.wait_for_host("absent", 10)
+            rig.start("there")
+            again = wait_for("frames again", lambda: newer(source, before.capture_time_ns + 2_000_000_000))
+            assert again.sequence > before.sequence and again.captured == again.sequence + sum(again.dropped)
+
+
+def newer(source: Any, time_ns: int) -> Any:
+    """The header of the next frame, if it is of after `time_ns`."""
+    with source.next(timeout=WAIT_S) as frame:
+        return frame.header if frame.header.capture_time_ns > time_ns else None

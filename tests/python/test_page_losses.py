@@ -95,6 +95,15 @@ PIXEL = """([x, y]) => {
 }"""
 
 
+def shown_at(wall: Wall, x: float) -> str:
+    """What is said of the place of the strip that is pointed at, from 0 to 1. The strip may still move as the page grows around it."""
+    box = wall.page.locator(".loss-strip").bounding_box()
+    assert box is not None
+    for y in (5, 6):
+        wall.page.mouse.move(box["x"] + x * box["width"], box["y"] + y)
+    return shown(wall)
+
+
 def test_a_lost_frame_is_small_and_a_gap_stands_out(browser: Browser, rig: Address) -> None:
     with opened(browser, rig) as wall:
         wall.wait_for_image("bad/color", "good/color")
@@ -118,13 +127,9 @@ def test_a_lost_frame_is_small_and_a_gap_stands_out(browser: Browser, rig: Addre
             assert tuple(pixel(x, 0.05)) == DISK
         assert pixel(0.48, 0.95) is None
         assert pixel(0.62, 0.95) is None
-        box = wall.page.locator(".loss-strip").bounding_box()
-        assert box is not None
-        wall.page.mouse.move(box["x"] + 0.55 * box["width"], box["y"] + 5)
-        until(lambda: shown(wall) == "08:20 to 10:00: 500 sets lost (the disk is too slow)", lambda: shown(wall))
+        until(lambda: shown_at(wall, 0.55) == "08:20 to 10:00: 500 sets lost (the disk is too slow)", lambda: shown(wall))
         save_screenshot(wall, "losses")
-        wall.page.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 5)
-        until(lambda: shown(wall).startswith("Losses at 3 moments"), lambda: shown(wall))
+        until(lambda: shown_at(wall, 0.3).startswith("Losses at 3 moments"), lambda: shown(wall))
         causes = wall.page.locator(".loss-cause").all_inner_texts()
         assert causes == ["disk", "computer", "camera or cable"]
         if AXE.exists():

@@ -2,13 +2,13 @@
 
 mod hosts;
 
-use crate::out;
+use crate::{out, printable};
 use crate::printable::{BOLD, GREEN, RED, RESET, YELLOW};
 use core::fmt::Write as _;
 use depthrig_bus::DropReason;
 use depthrig_daemon::status::{
     CameraState, CameraStatus, LinkState, LinkStatus, PreparingStatus, RecordingStatus, RefineState,
-    ReplayStatus, RigStatus, SignalState, SignalStatus, StreamStatus,
+    RefineStatus, ReplayStatus, RigStatus, SignalState, SignalStatus, StreamStatus,
 };
 use depthrig_recorder::report::page;
 use std::collections::BTreeMap;
@@ -79,7 +79,8 @@ pub fn status(rig: &RigStatus, style: Style) -> String {
     lines.extend(streams(rig, style));
     lines.extend(signals(rig, style));
     lines.extend(poor_metadata(rig));
-    lines.extend(rig.cameras.iter().filter_map(|c| refined(c, style)));
+    let of_camera = |c: &CameraStatus| Some(refined(&c.name, c.refine.as_ref()?, slowest_hz(c), style));
+    lines.extend(rig.cameras.iter().filter_map(of_camera));
     lines.extend(calibrated(rig, style));
     let troubles: Vec<_> = rig.cameras.iter().filter_map(|c| trouble(c, style)).collect();
     if !troubles.is_empty() {
@@ -259,16 +260,21 @@ fn poor_metadata(rig: &RigStatus) -> Option<String> {
     (!facts.is_empty()).then(|| format!("metadata  {}", facts.join("; ")))
 }
 
-/// Describes a camera's depth refinement on one line.
-fn refined(camera: &CameraStatus, style: Style) -> Option<String> {
-    let r = camera.refine.as_ref()?;
+/// The rate of the slowest of a camera's streams of images.
+fn slowest_hz(camera: &CameraStatus) -> Option<f64> {
+    let images = camera.streams.iter().filter(|s| !s.derived && s.samples_hz.is_none());
+    images.map(|s| s.nominal_hz).min_by(f64::total_cmp)
+}
+
+/// Describes a camera's depth refinement on one line; `camera_hz` is the rate of the slowest of its streams.
+fn refined(camera: &str, r: &RefineStatus, camera_hz: Option<f64>, style: Style) -> String {
     let color = match r.state {
         RefineState::Failed => Some(RED),
         RefineState::Running => None,
         _ => Some(YELLOW),
     };
     let state = color.map_or_else(|| r.state.name().to_owned(), |color| style.paint(color, r.state.name()));
-    let mut line = format!("refined   {}: {state}", camera.name);
+    let mut line = format!("refined   {}: {state}", printable::line(camera));
     if !r.engine.is_empty() {
         let _ = write!(line, ", {}", r.engine);
     }
@@ -277,9 +283,9 @@ fn refined(camera: &CameraStatus, style: Style) -> Option<String> {
     }
     if r.state == RefineState::Running {
         let _ = write!(line, ", {:.1} of {:.1} Hz", r.rate_hz, r.nominal_hz);
-        let camera_hz = camera.streams.iter().filter(|s| !s.derived && s.samples_hz.is_none());
-        let camera_hz = camera_hz.map(|s| s.nominal_hz).fold(f64::INFINITY, f64::min);
-        if camera_hz.is_finite() && r.nominal_hz < camera_hz {
+        if let Some(camera_hz) = camera_hz
+            && r.nominal_hz < camera_hz
+        {
             let _ = write!(line, " (limited by rate_hz of [camera.refine]; camera {camera_hz:.1} Hz)");
         }
         let step = |name: &str| r.steps_p50_ms.get(name).copied().unwrap_or(0.0);
@@ -292,7 +298,7 @@ fn refined(camera: &CameraStatus, style: Style) -> Option<String> {
     if let Some(why) = &r.message {
         let _ = write!(line, ": {why}");
     }
-    Some(line)
+    line
 }
 
 /// Frames that a stream lost. Superseded frames of a stream that the rig computes do not count: skipping them is how it

@@ -39,7 +39,7 @@ pub(super) fn read(
     let has_stereo = family.is_some_and(|f| f.has_stereo);
     let stereo = if has_stereo { stereo::read(&s, base) } else { None };
     let depth = stereo.as_ref().map_or_else(|| "depth".to_owned(), StereoConfig::first_depth);
-    let refine = refine::read(&s, base, &wanted, &depth);
+    let refine = refine::read(&s, base, &wanted, &depth, refine::TABLE);
     let record = record(&s, &streams, refine.is_some());
     // Which keys belong to an unknown family is unknown too.
     let family = family?;

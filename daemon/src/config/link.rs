@@ -1,13 +1,16 @@
 //! The table `[link]`: the part of this computer in a rig of several.
 
 use super::read::{FromToml, Section};
-use super::{HostConfig, LinkConfig, LinkRole, Reach};
+use super::{HostConfig, LinkConfig, LinkRole, Reach, refine};
 use depthrig_bus::{Name, StreamId};
 use std::net::SocketAddr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+
+/// The table of refined depth of a host's cameras.
+const REFINE: &str = "[link.hosts.refine]";
 
 /// Reads the table; `None` without one, and after a problem was noted.
-pub(super) fn read(top: &Section<'_, '_>) -> Option<LinkConfig> {
+pub(super) fn read(top: &Section<'_, '_>, base: &Path) -> Option<LinkConfig> {
     let s = top.table("link", "[link]");
     if !top.has("link") {
         return None;
@@ -25,13 +28,18 @@ pub(super) fn read(top: &Section<'_, '_>) -> Option<LinkConfig> {
         );
         s.problem(s.at, what);
     }
-    let hosts = hosts(&s, host.as_ref().map(|h| &h.value), role);
+    let hosts = hosts(&s, base, host.as_ref().map(|h| &h.value), role);
     s.finish();
     Some(LinkConfig { host: host?.value, role: role?, hosts: hosts? })
 }
 
 /// The other computers; `None` after a problem was noted.
-fn hosts(link: &Section<'_, '_>, own: Option<&Name>, role: Option<LinkRole>) -> Option<Vec<HostConfig>> {
+fn hosts(
+    link: &Section<'_, '_>,
+    base: &Path,
+    own: Option<&Name>,
+    role: Option<LinkRole>,
+) -> Option<Vec<HostConfig>> {
     let mut hosts: Vec<HostConfig> = Vec::new();
     let mut is_good = true;
     for mut s in link.tables("hosts", "[[link.hosts]]")? {
@@ -53,15 +61,35 @@ fn hosts(link: &Section<'_, '_>, own: Option<&Name>, role: Option<LinkRole>) -> 
         }
         let reach = reach(&s);
         let mirror = mirror(&s);
+        let refine = refine::read(&s, base, &[], "depth", REFINE);
+        let at = s.at;
         s.finish();
         match (name, reach, mirror) {
             (Some(name), Some(reach), Some(mirror)) => {
-                hosts.push(HostConfig { name: name.value, reach, mirror });
+                let host = HostConfig { name: name.value, reach, mirror, refine };
+                check_refined(link, at, &host);
+                hosts.push(host);
             }
             _ => is_good = false,
         }
     }
     is_good.then_some(hosts)
+}
+
+/// Refined depth needs streams to be made from, and a name that no mirrored stream has.
+fn check_refined(link: &Section<'_, '_>, at: usize, host: &HostConfig) {
+    let Some(refine) = &host.refine else { return };
+    let depth = &refine.depth;
+    let cameras = host.refined_cameras(depth);
+    let taken = |id: &&StreamId| cameras.contains(&id.camera) && refine::COMPUTED.contains(&id.stream.as_str());
+    let what = if cameras.is_empty() {
+        format!("{REFINE} needs a camera's color and {depth} in mirror, such as mirror = [\"wrist/color\", \"wrist/{depth}\"]")
+    } else if let Some(id) = host.mirror.iter().find(taken) {
+        format!("{id} comes from there by mirror and from {REFINE}; remove one of the two")
+    } else {
+        return;
+    };
+    link.problem(at, what);
 }
 
 /// Streams whose frames come from there; `None` after a problem was noted.

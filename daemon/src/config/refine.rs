@@ -22,15 +22,17 @@ const ENGINES: [(&str, EngineChoice); 5] = [
 ];
 const FORMATS: [(&str, PixelFormat); 2] = [("z16", PixelFormat::Z16), ("depth_f32", PixelFormat::DepthF32)];
 
-/// Reads `[camera.refine]` of a camera that is asked for `streams` and whose depth is in `depth` if nothing else is said; `None` when there is no such table.
+/// Reads `table` of a camera that is asked for `streams` and whose depth is in `depth` if nothing else is said, or of a host; `None` when there
+/// is no such table.
 pub(super) fn read(
     camera: &Section<'_, '_>,
     base: &Path,
     streams: &[WantedStream],
     depth: &str,
+    table: &'static str,
 ) -> Option<RefineConfig> {
     let present = camera.has("refine");
-    let s = camera.table("refine", TABLE);
+    let s = camera.table("refine", table);
     let d = RefineConfig::default();
     let config = RefineConfig {
         engine: s.choice("engine", &ENGINES, d.engine),
@@ -88,6 +90,15 @@ pub(super) fn read(
             useless("precision", "the engine \"tiny\" computes in fp32".to_owned());
         }
     }
+    for key in ["record", "corrected"] {
+        if table != TABLE && s.has(key) {
+            let what = format!(
+                "{} has no use: what comes from another computer is recorded and corrected there; remove it",
+                s.key_of(key)
+            );
+            s.problem(s.at_key(key), what);
+        }
+    }
     s.finish();
     if !present {
         return None;
@@ -96,7 +107,7 @@ pub(super) fn read(
     for needed in ["color", config.depth.as_str()] {
         if !streams.is_empty() && streams.iter().all(|w| w.request.stream.as_str() != needed) {
             let what = format!(
-                "{TABLE} needs the stream \"{needed}\", which is not among its [[camera.stream]] tables; add it"
+                "{table} needs the stream \"{needed}\", which is not among its [[camera.stream]] tables; add it"
             );
             camera.problem(at, what);
         }

@@ -55,7 +55,7 @@ pub(super) fn read(
     let cdm = refine::cdm(&top, &base);
     let cameras = cameras(&top, &base, families);
     let signals = signals(&top);
-    let link = link::read(&top);
+    let link = link::read(&top, &base);
     check_set_rate(&top, &sets, &cameras);
     top.finish();
     let text = text.to_owned();

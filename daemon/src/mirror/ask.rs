@@ -5,6 +5,7 @@ use super::numbers::Numbers;
 use super::pace::{Journey, Pace};
 use super::{HEAD_BYTES, Head};
 use crate::status::{MirrorState, MirrorStatus};
+use crate::wake::Wake;
 use core::time::Duration;
 use depthrig_bus::sync::lock;
 use depthrig_bus::{
@@ -63,13 +64,18 @@ impl Mirror {
         lock(&self.seen).clone()
     }
 
-    /// Publishes the stream's frames while `is_there` and until `stop`.
+    /// Publishes the stream's frames while `is_there` and until `stop`, and raises `wake` for each.
     ///
     /// # Errors
     /// When this rig's bus cannot be opened.
-    pub(crate) fn run(&self, is_there: &dyn Fn() -> bool, stop: &AtomicBool) -> crate::Result<()> {
+    pub(crate) fn run(
+        &self,
+        is_there: &dyn Fn() -> bool,
+        wake: &Wake,
+        stop: &AtomicBool,
+    ) -> crate::Result<()> {
         let bus = Bus::open(&self.runtime, &self.rig)?;
-        let mut stream = Stream { mirror: self, bus: &bus, publisher: None, numbers: Numbers::default() };
+        let mut stream = Stream { mirror: self, bus: &bus, wake, publisher: None, numbers: Numbers::default() };
         let mut why = String::new();
         while !stop.load(Ordering::Relaxed) {
             if is_there() {
@@ -99,6 +105,7 @@ impl Mirror {
 struct Stream<'a> {
     mirror: &'a Mirror,
     bus: &'a Bus,
+    wake: &'a Wake,
     /// With the largest image that its slots hold.
     publisher: Option<(Publisher, usize)>,
     numbers: Numbers,
@@ -246,7 +253,9 @@ impl Stream<'_> {
         *slot.header_mut() = *header;
         self.numbers.number(slot.header_mut());
         let Some((publisher, _)) = &self.publisher else { return Ok(()) };
-        publisher.send(slot).map(drop).map_err(io::Error::other)
+        publisher.send(slot).map_err(io::Error::other)?;
+        self.wake.raise();
+        Ok(())
     }
 
     /// Writes down that a frame came; `counted` is when the rate was last counted, and the frames until then.

@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::status::MirrorState;
+use crate::wake::Wake;
 use core::time::Duration;
 use depthrig_bus::{
     Bus, FrameHeader, HEADER_SIZE, HostTime, PixelFormat, Publisher, RigName, RuntimeDir, StreamId,
@@ -106,7 +107,7 @@ fn frames_of_one_bus_are_on_the_other_with_times_of_the_session() {
             let ended = answer(to, &clock, &|| stop.load(Ordering::Relaxed));
             assert!(ended.is_ok() || stop.load(Ordering::Relaxed), "{ended:?}");
         });
-        s.spawn(|| mirror.run(&|| true, &stop).unwrap());
+        s.spawn(|| mirror.run(&|| true, &Wake::default(), &stop).unwrap());
         s.spawn(|| {
             let mut n = 0;
             while !stop.load(Ordering::Relaxed) {
@@ -188,7 +189,7 @@ fn what_a_peer_should_not_send_is_refused_and_named() {
                 // Nothing more comes, and the connection stays open until the other side ends it.
                 let _ = peer.read_to_end(&mut Vec::new());
             });
-            s.spawn(|| mirror.run(&|| true, &stop).unwrap());
+            s.spawn(|| mirror.run(&|| true, &Wake::default(), &stop).unwrap());
             wait_for(&mirror, |m| m.why.as_deref().is_some_and(|said| said.contains(why)));
             assert_eq!((mirror.status().state, mirror.status().frames), (MirrorState::Waiting, 0), "{why}");
         });
@@ -207,7 +208,7 @@ fn a_daemon_that_refuses_is_quoted() {
             let head = format!("404 Not Found\r\nContent-Length: {}", body.len());
             accept(&there.socket, &head).write_all(body.as_bytes()).unwrap();
         });
-        s.spawn(|| mirror.run(&|| true, &stop).unwrap());
+        s.spawn(|| mirror.run(&|| true, &Wake::default(), &stop).unwrap());
         wait_for(&mirror, |m| m.why.as_deref() == Some("unknown path"));
     });
 }

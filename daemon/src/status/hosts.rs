@@ -1,5 +1,6 @@
 //! The other computers of a rig, as the one that records sees them.
 
+use super::RefineStatus;
 use serde::{Deserialize, Serialize};
 
 /// The other computers, and what became of their parts of the newest recording.
@@ -40,6 +41,17 @@ pub struct HostStatus {
     pub recording: Option<String>,
     /// Its streams that subscribers of this computer read.
     pub mirrors: Vec<MirrorStatus>,
+    /// Its cameras whose depth is refined on this computer.
+    pub refined: Vec<HostRefineStatus>,
+}
+
+/// A camera of another computer whose depth is refined on this one.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct HostRefineStatus {
+    /// The camera.
+    pub camera: String,
+    /// How it goes; `None` until frames of colour and depth have come.
+    pub refine: Option<RefineStatus>,
 }
 
 /// A stream of another computer that subscribers of this one read.

@@ -5,7 +5,7 @@ use depthrig_daemon::control::{
     RecordingLosses, ReplayControl, SeekRequest, UncertaintyOfImage,
 };
 use depthrig_daemon::status::{
-    CameraState, CameraStatus, ClockStatus, HostState, HostStatus, HostsStatus, JoinState, LinkState,
+    CameraState, CameraStatus, ClockStatus, HostRefineStatus, HostState, HostStatus, HostsStatus, JoinState, LinkState,
     LinkStatus, MirrorState, MirrorStatus, PartStatus, PreparingStatus, RecordingStatus, RefineState,
     RefineStatus, ReplayStatus, RigStatus, SessionStatus, SetAccount, SetStatus, SharedMemoryStatus,
     SignalState, SignalStatus, StreamStatus,
@@ -180,6 +180,7 @@ impl Fake {
                         frames: 900,
                         skipped: 3,
                     }],
+                    refined: vec![HostRefineStatus { camera: "wrist".into(), refine: None }],
                     host: "top".into(),
                     state: HostState::Refused,
                     why: Some("its rig is \"other\"".into()),

@@ -1,6 +1,6 @@
 //! The other computers of a rig in the status: a line for each, and one for what became of their parts.
 
-use super::{RED, Style};
+use super::{RED, Style, refined};
 use crate::{out, printable};
 use depthrig_daemon::status::{
     HostState, HostStatus, HostsStatus, JoinState, MirrorState, MirrorStatus, PartStatus, SessionStatus,
@@ -10,7 +10,11 @@ use depthrig_daemon::status::{
 pub(super) fn lines(status: &HostsStatus, style: Style) -> Vec<String> {
     let hosts = status.hosts.iter().flat_map(|h| {
         let mirrors = h.mirrors.iter().map(move |m| mirror(&h.host, m, style));
-        core::iter::once(host(h, style)).chain(mirrors)
+        let refined = h.refined.iter().map(move |r| match &r.refine {
+            Some(refine) => refined(&r.camera, refine, None, style),
+            None => format!("refined   {}: waits for its color and depth", printable::line(&r.camera)),
+        });
+        core::iter::once(host(h, style)).chain(mirrors).chain(refined)
     });
     hosts.chain(status.session.iter().flat_map(|s| session(s, style))).collect()
 }

@@ -27,7 +27,7 @@ fn the_recorder_names_the_other_computers() {
          mirror = [\"wrist/color\", \"wrist/depth\"]\n\
          [[link.hosts]]\nname = \"far\"\nsocket = \"/run/far.sock\"",
     );
-    let host = |name: &str, reach| HostConfig { name: name.parse().unwrap(), reach, mirror: Vec::new() };
+    let host = |name: &str, reach| HostConfig { name: name.parse().unwrap(), reach, mirror: Vec::new(), refine: None };
     let ssh = |to: &str, socket: Option<&str>| Reach::Ssh {
         destination: to.to_owned(),
         socket: socket.map(Into::into),
@@ -54,6 +54,20 @@ fn the_recorder_names_the_other_computers() {
         (
             "[[link.hosts]]\nname = \"a\"\nssh = \"b\"\nmirror = [\"top\"]",
             "\"mirror\" in [[link.hosts]] \"a\" value 1 must name a stream",
+        ),
+        (
+            "[[link.hosts]]\nname = \"a\"\nssh = \"b\"\nmirror = [\"c/color\"]\n[link.hosts.refine]",
+            "[link.hosts.refine] needs a camera's color and depth in mirror",
+        ),
+        (
+            "[[link.hosts]]\nname = \"a\"\nssh = \"b\"\nmirror = [\"c/color\", \"c/depth\", \"c/depth_refined\"]\n\
+             [link.hosts.refine]",
+            "c/depth_refined comes from there by mirror and from [link.hosts.refine]",
+        ),
+        (
+            "[[link.hosts]]\nname = \"a\"\nssh = \"b\"\nmirror = [\"c/color\", \"c/depth\"]\n[link.hosts.refine]\n\
+             record = false",
+            "\"record\" in [link.hosts.refine] has no use",
         ),
         ("hosts = [\"left\"]", "must be written as tables, each headed [[link.hosts]]"),
     ] {
