@@ -3,7 +3,8 @@
 mod hosts;
 
 pub use hosts::{
-    HostRefineStatus, HostState, HostStatus, HostsStatus, JoinState, MirrorState, MirrorStatus, PartStatus, SessionStatus,
+    HostRefineStatus, HostState, HostStatus, HostsStatus, JoinState, MirrorState, MirrorStatus, PartStatus,
+    SessionStatus,
 };
 
 use depthrig_recorder::Episode;

@@ -2,8 +2,8 @@
 
 mod hosts;
 
-use crate::{out, printable};
 use crate::printable::{BOLD, GREEN, RED, RESET, YELLOW};
+use crate::{out, printable};
 use core::fmt::Write as _;
 use depthrig_bus::DropReason;
 use depthrig_daemon::status::{

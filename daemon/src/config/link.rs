@@ -81,9 +81,12 @@ fn check_refined(link: &Section<'_, '_>, at: usize, host: &HostConfig) {
     let Some(refine) = &host.refine else { return };
     let depth = &refine.depth;
     let cameras = host.refined_cameras(depth);
-    let taken = |id: &&StreamId| cameras.contains(&id.camera) && refine::COMPUTED.contains(&id.stream.as_str());
+    let taken =
+        |id: &&StreamId| cameras.contains(&id.camera) && refine::COMPUTED.contains(&id.stream.as_str());
     let what = if cameras.is_empty() {
-        format!("{REFINE} needs a camera's color and {depth} in mirror, such as mirror = [\"wrist/color\", \"wrist/{depth}\"]")
+        format!(
+            "{REFINE} needs a camera's color and {depth} in mirror, such as mirror = [\"wrist/color\", \"wrist/{depth}\"]"
+        )
     } else if let Some(id) = host.mirror.iter().find(taken) {
         format!("{id} comes from there by mirror and from {REFINE}; remove one of the two")
     } else {

@@ -53,7 +53,7 @@ impl HostRefine {
     /// Gives the camera to the stage, once `there` has both streams and frames of them come.
     ///
     /// # Errors
-    /// Those of channels that cannot be opened, and of a stream that is no depth.
+    /// Those of channels that cannot be opened, and `BadInput` for streams other than images.
     pub(super) fn begin(&self, there: &RigStatus, place: Place<'_>) -> Result<()> {
         if self.refinement.get().is_some() {
             return Ok(());
@@ -62,7 +62,9 @@ impl HostRefine {
         let stream = |name: &str| -> Result<Option<(Subscriber, FrameHeader, StreamProfile)>> {
             let id = StreamId { camera: self.camera.clone(), stream: StreamName::new(name)? };
             let mut all = there.cameras.iter().flat_map(|camera| &camera.streams);
-            let Some(rate_hz) = all.find(|s| s.id == id.to_string()).map(|s| s.nominal_hz) else { return Ok(None) };
+            let Some(rate_hz) = all.find(|s| s.id == id.to_string()).map(|s| s.nominal_hz) else {
+                return Ok(None);
+            };
             let mut reader = match bus.subscriber(&id) {
                 Err(e) if e.kind() == depthrig_bus::ErrorKind::NotFound => return Ok(None),
                 reader => reader?,

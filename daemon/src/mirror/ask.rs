@@ -75,7 +75,8 @@ impl Mirror {
         stop: &AtomicBool,
     ) -> crate::Result<()> {
         let bus = Bus::open(&self.runtime, &self.rig)?;
-        let mut stream = Stream { mirror: self, bus: &bus, wake, publisher: None, numbers: Numbers::default() };
+        let mut stream =
+            Stream { mirror: self, bus: &bus, wake, publisher: None, numbers: Numbers::default() };
         let mut why = String::new();
         while !stop.load(Ordering::Relaxed) {
             if is_there() {

@@ -5,10 +5,10 @@ use depthrig_daemon::control::{
     RecordingLosses, ReplayControl, SeekRequest, UncertaintyOfImage,
 };
 use depthrig_daemon::status::{
-    CameraState, CameraStatus, ClockStatus, HostRefineStatus, HostState, HostStatus, HostsStatus, JoinState, LinkState,
-    LinkStatus, MirrorState, MirrorStatus, PartStatus, PreparingStatus, RecordingStatus, RefineState,
-    RefineStatus, ReplayStatus, RigStatus, SessionStatus, SetAccount, SetStatus, SharedMemoryStatus,
-    SignalState, SignalStatus, StreamStatus,
+    CameraState, CameraStatus, ClockStatus, HostRefineStatus, HostState, HostStatus, HostsStatus, JoinState,
+    LinkState, LinkStatus, MirrorState, MirrorStatus, PartStatus, PreparingStatus, RecordingStatus,
+    RefineState, RefineStatus, ReplayStatus, RigStatus, SessionStatus, SetAccount, SetStatus,
+    SharedMemoryStatus, SignalState, SignalStatus, StreamStatus,
 };
 use depthrig_daemon::{Error, ErrorKind, Result};
 use depthrig_recorder::{Episode, EpisodeOutcome};

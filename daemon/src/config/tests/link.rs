@@ -27,7 +27,12 @@ fn the_recorder_names_the_other_computers() {
          mirror = [\"wrist/color\", \"wrist/depth\"]\n\
          [[link.hosts]]\nname = \"far\"\nsocket = \"/run/far.sock\"",
     );
-    let host = |name: &str, reach| HostConfig { name: name.parse().unwrap(), reach, mirror: Vec::new(), refine: None };
+    let host = |name: &str, reach| HostConfig {
+        name: name.parse().unwrap(),
+        reach,
+        mirror: Vec::new(),
+        refine: None,
+    };
     let ssh = |to: &str, socket: Option<&str>| Reach::Ssh {
         destination: to.to_owned(),
         socket: socket.map(Into::into),
