@@ -367,6 +367,12 @@ impl Default for SupervisorConfig {
 }
 
 impl RigConfig {
+    /// Whether depth of any camera is refined, of this computer or of another one.
+    pub fn has_refined(&self) -> bool {
+        let hosts = self.link.iter().flat_map(|link| &link.hosts);
+        self.cameras.iter().any(|c| c.refine.is_some()) || hosts.into_iter().any(|h| h.refine.is_some())
+    }
+
     /// Reads the file at `path`.
     ///
     /// # Errors

@@ -225,11 +225,6 @@ impl Hosts {
         }
     }
 
-    /// Whether depth of any host is refined here.
-    pub fn has_refined(&self) -> bool {
-        self.others.iter().any(|host| !host.refined.is_empty())
-    }
-
     /// Keeps host `number` in step until `stop`. `active` is the folder that is being recorded into here; its depth is refined at `place`.
     ///
     /// # Errors

@@ -249,8 +249,7 @@ impl Rig {
         }
         let inner = Arc::clone(&rig.inner);
         rig.spawn("supervisor", move |stop| supervise(&inner, stop))?;
-        let has_refined = rig.inner.hosts.as_ref().is_some_and(|hosts| hosts.has_refined());
-        if has_refined || rig.inner.config.cameras.iter().any(|c| c.refine.is_some()) {
+        if rig.inner.config.has_refined() {
             let config = &rig.inner.config;
             let shared = &rig.inner.shared;
             let intake = Arc::clone(&shared.stage);
