@@ -207,6 +207,7 @@ def session(hosts: TwoHosts, options: argparse.Namespace, folder: Path, runtime:
     wait_for("the cameras", lambda: right.is_ready() and left.is_ready(), RENDER_S)
     link = lambda: right.status()["hosts"]["hosts"][0]  # noqa: E731
     wait_for("the other computer", lambda: link()["has_clock"])
+    wait_for("its live frames", lambda: link()["mirrors"][0]["state"] != "waiting")
     print(right.ask("record", "start", "--name", "demo", "--scene", "table"), end="", flush=True)
     with Clock(left.runtime / "mount.sock") as seen_clock:
         begun = time.monotonic()
