@@ -56,6 +56,10 @@ def check_metadata(wheel: zipfile.ZipFile) -> None:
     assert len([line for line in needed if "extra ==" not in line]) == len(project["dependencies"])
     [program] = [info for info in wheel.infolist() if info.filename.endswith(".data/scripts/depthrig")]
     assert program.external_attr >> 16 & 0o777 == 0o755, oct(program.external_attr >> 16)
+    [entries] = [name for name in wheel.namelist() if name.endswith(".dist-info/entry_points.txt")]
+    package = tomllib.loads((ROOT / "python/pyproject.toml").read_text())["project"]
+    told = dict(line.split(" = ") for line in wheel.read(entries).decode().splitlines()[1:])
+    assert told == package["scripts"], told
     print(f"{Path(wheel.filename).name}: extras {', '.join(sorted(project['optional-dependencies']))}")
 
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Finishes the wheel that maturin built: puts libusb beside the binary and takes this computer's paths out of the list of parts.
+"""Finishes the wheel that maturin built: puts libusb beside the binary, adds the programs of the Python package, and takes this computer's paths out of the list of parts.
 
     tools/dist/wheel.py WHEEL LIBUSB-FOLDER OUT-FOLDER
 
@@ -13,6 +13,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -28,6 +29,13 @@ def put_libusb(tree: Path, libusb: Path) -> None:
     licenses = next(tree.glob("*.dist-info")) / "licenses"
     licenses.mkdir(exist_ok=True)
     shutil.copy(libusb / "COPYING", licenses / "COPYING.libusb")
+
+
+def put_programs(tree: Path) -> None:
+    """Adds the programs of the Python package, which maturin refuses beside a binary."""
+    scripts = tomllib.loads((ROOT / "python/pyproject.toml").read_text())["project"]["scripts"]
+    lines = [f"{name} = {entry}\n" for name, entry in scripts.items()]
+    (next(tree.glob("*.dist-info")) / "entry_points.txt").write_text("[console_scripts]\n" + "".join(lines))
 
 
 def parts(tree: Path, libusb: Path) -> bytes:
@@ -60,6 +68,7 @@ def main(wheel: Path, libusb: Path, out: Path) -> None:
         subprocess.run([*tool, "unpack", "--dest", work, str(wheel)], check=True)
         [tree] = Path(work).iterdir()
         put_libusb(tree, libusb)
+        put_programs(tree)
         (out / "depthrig.cdx.json").write_bytes(parts(tree, libusb))
         [binary] = tree.glob("*.data/scripts/depthrig")
         shutil.copy(binary, out / "depthrig")
