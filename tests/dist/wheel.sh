@@ -23,7 +23,7 @@ engine_missing | grep -q 'pip install onnxruntime'
 environment/bin/pip install --quiet --disable-pip-version-check --no-index --find-links /wheels onnxruntime
 [ "$(engine_missing)" = found ]
 echo "ONNX Runtime: missing, then found in the wheel onnxruntime"
-environment/bin/python -m depthrig.oak --help >/dev/null
+for name in oak ros2; do environment/bin/depthrig-$name --help >/dev/null; done
 environment/bin/pip uninstall --quiet --yes depthrig
 [ ! -e "$program" ] && [ ! -e environment/lib/depthrig/libusb-1.0.so.0 ]
 echo "wheel: installed, recorded, verified, read from Python, removed"
