@@ -97,7 +97,7 @@ pub struct HostConfig {
     pub reach: Reach,
     /// Its streams that subscribers of this computer read.
     pub mirror: Vec<StreamId>,
-    /// How this computer refines the depth of its mirrored cameras; `None`: not at all.
+    /// Refinement on this computer of the depth of its mirrored cameras; `None`: not at all.
     pub refine: Option<RefineConfig>,
 }
 
@@ -367,7 +367,7 @@ impl Default for SupervisorConfig {
 }
 
 impl RigConfig {
-    /// Whether depth of any camera is refined, of this computer or of another one.
+    /// Is true if depth of any camera is refined, of this computer or of another one.
     pub fn has_refined(&self) -> bool {
         let hosts = self.link.iter().flat_map(|link| &link.hosts);
         self.cameras.iter().any(|c| c.refine.is_some()) || hosts.into_iter().any(|h| h.refine.is_some())

@@ -106,9 +106,7 @@ impl Host {
     /// Gives its cameras to the stage that refines depth.
     fn begin_refined(&self, status: &RigStatus, place: Place<'_>) {
         for refine in &self.refined {
-            if let Err(e) = refine.begin(status, place) {
-                tracing::error!("host {}: no refined depth: {e}", self.config.name);
-            }
+            refine.begin(status, place);
         }
     }
 

@@ -22,8 +22,8 @@ const ENGINES: [(&str, EngineChoice); 5] = [
 ];
 const FORMATS: [(&str, PixelFormat); 2] = [("z16", PixelFormat::Z16), ("depth_f32", PixelFormat::DepthF32)];
 
-/// Reads `table` of a camera that is asked for `streams` and whose depth is in `depth` if nothing else is said, or of a host; `None` when there
-/// is no such table.
+/// Reads `table` of a camera that is asked for `streams` and whose depth is in `depth` if nothing else is said, or of a host; `None` without
+/// the table.
 pub(super) fn read(
     camera: &Section<'_, '_>,
     base: &Path,

@@ -2,16 +2,17 @@
 
 use crate::config::HostConfig;
 use crate::stage::{self, Intake, Readers, Refinement, Setup};
-use crate::status::{HostRefineStatus, RigStatus};
+use crate::status::{CameraState, HostRefineStatus, RigStatus};
 use crate::stream::Stream;
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
+use depthrig_bus::sync::lock;
 use depthrig_bus::{
     Bus, CameraName, ClockDomain, FrameHeader, MetadataLevel, PixelFormat, StreamId, StreamName, Subscriber,
 };
 use depthrig_cdm::stage::RefineConfig;
 use depthrig_driver::{DeviceClock, StreamProfile};
-use std::sync::{Arc, OnceLock};
+use std::sync::{Arc, Mutex, OnceLock};
 
 /// A mirrored stream that is read sends its first frame within this.
 const FIRST_FRAME: Duration = Duration::from_secs(1);
@@ -33,6 +34,8 @@ pub(super) struct HostRefine {
     camera: CameraName,
     config: RefineConfig,
     refinement: OnceLock<Arc<Refinement>>,
+    /// The last reason why it did not begin, which is logged once.
+    why: Mutex<String>,
 }
 
 impl HostRefine {
@@ -40,31 +43,43 @@ impl HostRefine {
     pub(super) fn of(host: &HostConfig) -> Vec<Self> {
         let Some(config) = &host.refine else { return Vec::new() };
         let cameras = host.refined_cameras(&config.depth);
-        let refine = |camera| Self { camera, config: config.clone(), refinement: OnceLock::new() };
+        let refine = |camera| Self {
+            camera,
+            config: config.clone(),
+            refinement: OnceLock::new(),
+            why: Mutex::default(),
+        };
         cameras.into_iter().map(refine).collect()
     }
 
-    /// How it goes; it waits until frames of both streams have come.
+    /// Its state; it waits until frames of both streams have come.
     pub(super) fn status(&self) -> HostRefineStatus {
         let refine = self.refinement.get().map(|refinement| refinement.status());
         HostRefineStatus { camera: self.camera.to_string(), refine }
     }
 
-    /// Gives the camera to the stage, once `there` has both streams and frames of them come.
-    ///
-    /// # Errors
-    /// Those of channels that cannot be opened, and `BadInput` for streams other than images.
-    pub(super) fn begin(&self, there: &RigStatus, place: Place<'_>) -> Result<()> {
+    /// Gives the camera to the stage, once it streams `there` and frames of both streams come; a reason against it is logged.
+    pub(super) fn begin(&self, there: &RigStatus, place: Place<'_>) {
         if self.refinement.get().is_some() {
-            return Ok(());
+            return;
         }
+        let now = self.try_begin(there, place).err().map(|e| e.to_string()).unwrap_or_default();
+        let mut why = lock(&self.why);
+        if *why != now && !now.is_empty() {
+            tracing::error!("camera {}: its depth is not refined here: {now}", self.camera);
+        }
+        *why = now;
+    }
+
+    fn try_begin(&self, there: &RigStatus, place: Place<'_>) -> Result<()> {
         let Place { bus, intake } = place;
         let stream = |name: &str| -> Result<Option<(Subscriber, FrameHeader, StreamProfile)>> {
             let id = StreamId { camera: self.camera.clone(), stream: StreamName::new(name)? };
-            let mut all = there.cameras.iter().flat_map(|camera| &camera.streams);
-            let Some(rate_hz) = all.find(|s| s.id == id.to_string()).map(|s| s.nominal_hz) else {
-                return Ok(None);
-            };
+            // Frames of another one are not waited for, because pulling would wait too.
+            let live = there.cameras.iter().filter(|camera| camera.state == CameraState::Streaming);
+            let mut all = live.flat_map(|camera| &camera.streams);
+            let rate_hz = all.find(|s| s.id == id.to_string()).map(|s| s.nominal_hz);
+            let Some(rate_hz) = rate_hz.filter(|hz| hz.is_finite() && *hz > 0.0) else { return Ok(None) };
             let mut reader = match bus.subscriber(&id) {
                 Err(e) if e.kind() == depthrig_bus::ErrorKind::NotFound => return Ok(None),
                 reader => reader?,
@@ -73,7 +88,8 @@ impl HostRefine {
                 return Ok(None);
             };
             let profile = profile(&id, &header, rate_hz).ok_or_else(|| {
-                let what = format!("{id}: frames of format {} cannot be refined", header.format);
+                let what =
+                    format!("{id} has no images; remove [link.hosts.refine], or this camera from mirror");
                 Error::new(ErrorKind::BadInput, what)
             })?;
             Ok(Some((reader, header, profile)))

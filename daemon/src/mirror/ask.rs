@@ -181,7 +181,7 @@ impl Stream<'_> {
         Ok(())
     }
 
-    /// Whether nobody here reads the stream. It stays on the bus for the next subscriber, which gets no frame of before: the publisher is another
+    /// True while nobody here reads the stream. It stays on the bus for the next subscriber, which gets no frame of before: the publisher is another
     /// one, because each keeps its last frame for those that come late.
     fn is_unread(&mut self) -> io::Result<bool> {
         let Some((publisher, room)) = &self.publisher else { return Ok(false) };

@@ -50,7 +50,7 @@ pub struct HostStatus {
 pub struct HostRefineStatus {
     /// The camera.
     pub camera: String,
-    /// How it goes; `None` until frames of colour and depth have come.
+    /// Its state; `None` until frames of colour and depth have come.
     pub refine: Option<RefineStatus>,
 }
 
