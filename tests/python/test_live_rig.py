@@ -105,12 +105,14 @@ def rig(binary: str, runtime: Path, tmp_path_factory: pytest.TempPathFactory) ->
         where = address(binary, runtime, "lab")
         rig = Rig(where.origin, where.token, folder)
 
-        def comes() -> bool:
-            cameras = rig.ask("GET", "/v1/status")["cameras"]
-            # The fault of the camera in front is over.
-            return all(c["state"] == "streaming" for c in cameras) and cameras[0]["reconnects"] == 1
+        def cameras() -> list[dict]:
+            return rig.ask("GET", "/v1/status")["cameras"]
 
-        until(comes)
+        # The fault of the camera in front is over.
+        until(
+            lambda: all(c["state"] == "streaming" for c in cameras()) and cameras()[0]["reconnects"] >= 1,
+            lambda: json.dumps(cameras(), indent=1),
+        )
         yield rig
 
 

@@ -10,8 +10,12 @@ use std::time::Duration;
 
 /// One camera with `fault` at 1 s and two without; runs until `seen` of the bad camera and it streams again.
 fn run(kind: &str, more: &str, seen: impl Fn(&RigStatus) -> bool) -> RigStatus {
+    run_at(1.0, kind, more, seen)
+}
+
+fn run_at(at_s: f64, kind: &str, more: &str, seen: impl Fn(&RigStatus) -> bool) -> RigStatus {
     let text =
-        RigText::default().camera("good", "").camera("bad", "").fault(kind, 1.0, more).camera("fine", "");
+        RigText::default().camera("good", "").camera("bad", "").fault(kind, at_s, more).camera("fine", "");
     let home = Home::default();
     let rig = home.start(text.text()).unwrap();
     wait_until(&rig, kind, &seen);
@@ -39,6 +43,12 @@ fn an_unplugged_camera_comes_back() {
         camera(&status, "bad").streams[0].clock.epoch >= 1,
         "a device that starts afresh has a new clock map"
     );
+}
+
+#[test]
+fn a_camera_that_is_lost_before_it_was_seen_to_stream_came_back() {
+    let status = run_at(0.001, "unplug", "duration_s = 0.05", |s| camera(s, "bad").reconnects > 0);
+    assert_eq!(camera(&status, "bad").reconnects, 1);
 }
 
 #[test]

@@ -235,7 +235,8 @@ impl Supervisor {
     /// The camera is lost; it is tried again after a pause.
     fn lose(&mut self, now: HostTime, why: &str, error: Option<depthrig_driver::Error>) {
         let mut state = self.camera.state();
-        self.lost |= state.phase != CameraState::Opening;
+        // Once it was open it counts, even if it was lost before it was seen to stream.
+        self.lost |= !state.streams.is_empty();
         state.enter(self.camera.config.name.as_str(), CameraState::Reconnecting, Some(why.to_owned()));
         state.error = error.map(Into::into);
         drop(state);
