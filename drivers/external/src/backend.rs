@@ -27,7 +27,8 @@ pub struct ExternalBackend {
 impl ExternalBackend {
     /// The camera at `place`, served as `config` says. Nothing is started before [`Backend::open`].
     pub fn new(config: ExternalConfig, place: Place) -> Self {
-        let keeper = (!config.command.is_empty()).then(|| Arc::new(Mutex::new(Keeper::new(&config, &place))));
+        let keeper =
+            (!config.command.is_empty()).then(|| Arc::new(Mutex::new(Keeper::new(config.program(&place)))));
         Self { config, place, keeper }
     }
 

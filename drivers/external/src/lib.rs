@@ -12,7 +12,7 @@ pub(crate) mod facts;
 pub mod fuzzing;
 mod intake;
 mod log;
-mod process;
+pub mod process;
 mod rate_limiter;
 mod stream;
 
@@ -20,7 +20,9 @@ pub use backend::ExternalBackend;
 pub use depthrig_bus::external::{Place, served};
 
 use core::time::Duration;
-use depthrig_bus::external::{Beat, ExternalReason};
+use depthrig_bus::external::{Beat, CAMERA_VARIABLE, ExternalReason, RIG_VARIABLE};
+use depthrig_bus::runtime::RUNTIME_DIR_VARIABLE;
+use process::{Owner, Program};
 use std::path::PathBuf;
 
 /// The backend's name in a rig file.
@@ -46,6 +48,22 @@ impl Default for ExternalConfig {
             directory: PathBuf::from("."),
             start_timeout: Duration::from_secs(10),
             heartbeat_timeout: Duration::from_secs(2),
+        }
+    }
+}
+
+impl ExternalConfig {
+    /// The program that serves the camera at `place`.
+    fn program(&self, place: &Place) -> Program {
+        Program {
+            owner: Owner::Camera(place.camera.to_string()),
+            command: self.command.clone(),
+            directory: self.directory.clone(),
+            environment: vec![
+                (RUNTIME_DIR_VARIABLE, place.runtime.path().into()),
+                (RIG_VARIABLE, place.rig.as_str().into()),
+                (CAMERA_VARIABLE, place.camera.as_str().into()),
+            ],
         }
     }
 }

@@ -1,16 +1,16 @@
-//! The process of a camera that the daemon starts itself: start, restart, and end with its whole group.
+//! A process that the daemon starts itself, such as that of a camera: start, restart, and end with its whole group.
 #![allow(unsafe_code)] // `pre_exec` runs between fork and exec, where only some calls are allowed
 
-use super::{ExternalConfig, Place, log};
+use super::log;
 use core::sync::atomic::{AtomicBool, Ordering};
 use core::time::Duration;
-use depthrig_bus::external::{CAMERA_VARIABLE, RIG_VARIABLE};
-use depthrig_bus::runtime::RUNTIME_DIR_VARIABLE;
 use depthrig_bus::sync::lock;
 use depthrig_bus::{HostTime, umask};
 use depthrig_driver::{Error, ErrorKind, Result};
 use rustix::process::{Pid, Signal, kill_process_group};
+use std::ffi::OsString;
 use std::os::unix::process::CommandExt;
+use std::path::PathBuf;
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::mpsc::{SyncSender, sync_channel};
 use std::sync::{Arc, Mutex};
@@ -28,11 +28,49 @@ const LOOK: Duration = Duration::from_millis(20);
 /// The process of a camera, if the daemon runs it.
 pub(super) type SharedKeeper = Option<Arc<Mutex<Keeper>>>;
 
-/// Keeps the process of one camera running. Dropping it ends the process.
+/// A program, and how it is started.
+#[derive(Debug, Clone)]
+pub struct Program {
+    /// Whose it is, in the log.
+    pub owner: Owner,
+    /// The program, with its arguments.
+    pub command: Vec<String>,
+    /// Where it runs.
+    pub directory: PathBuf,
+    /// Variables of its environment, beside those of this process.
+    pub environment: Vec<(&'static str, OsString)>,
+}
+
+/// Whose program it is.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Owner {
+    /// That of a camera of this name.
+    Camera(String),
+    /// One of the rig.
+    Rig(&'static str),
+}
+
+impl Owner {
+    fn name(&self) -> &str {
+        match self {
+            Self::Camera(name) => name,
+            Self::Rig(name) => name,
+        }
+    }
+
+    fn camera(&self) -> Option<&str> {
+        matches!(self, Self::Camera(_)).then(|| self.name())
+    }
+
+    fn program(&self) -> Option<&str> {
+        matches!(self, Self::Rig(_)).then(|| self.name())
+    }
+}
+
+/// Keeps one process running. Dropping it ends the process.
 #[derive(Debug)]
-pub(super) struct Keeper {
-    config: ExternalConfig,
-    place: Place,
+pub struct Keeper {
+    program: Program,
     running: Option<Running>,
     pause: Duration,
     not_before: HostTime,
@@ -64,19 +102,12 @@ impl Shared {
 
 impl Keeper {
     /// One that has started nothing yet.
-    pub(super) fn new(config: &ExternalConfig, place: &Place) -> Self {
-        Self {
-            config: config.clone(),
-            place: place.clone(),
-            running: None,
-            pause: FIRST_PAUSE,
-            not_before: HostTime::from_ns(0),
-            last_end: None,
-        }
+    pub const fn new(program: Program) -> Self {
+        Self { program, running: None, pause: FIRST_PAUSE, not_before: HostTime::from_ns(0), last_end: None }
     }
 
     /// The number of the process, if it runs.
-    pub(super) fn pid(&self) -> Option<u32> {
+    pub fn pid(&self) -> Option<u32> {
         self.running.as_ref().filter(|r| r.shared.ended().is_none()).map(|r| r.pid)
     }
 
@@ -85,7 +116,7 @@ impl Keeper {
     /// # Errors
     /// [`ErrorKind::NotFound`] while it pauses before the next try, saying how it ended; [`ErrorKind::BadInput`] when
     /// the program does not exist.
-    pub(super) fn ensure(&mut self) -> Result<()> {
+    pub fn ensure(&mut self) -> Result<()> {
         self.notice_end();
         if self.running.is_some() {
             return Ok(());
@@ -103,9 +134,15 @@ impl Keeper {
     }
 
     /// Kills a process that does not do what it must; [`Self::ensure`] starts it again.
-    pub(super) fn kill(&mut self, why: &str) {
+    pub fn kill(&mut self, why: &str) {
         let Some(running) = &self.running else { return };
-        tracing::warn!(camera = %self.place.camera, pid = running.pid, "the process is killed: {why}");
+        let owner = &self.program.owner;
+        tracing::warn!(
+            camera = owner.camera(),
+            program = owner.program(),
+            pid = running.pid,
+            "the process is killed: {why}"
+        );
         running.shared.kill.store(true, Ordering::Relaxed);
         let deadline = HostTime::now().plus(GRACE);
         while running.shared.ended().is_none() && !deadline.from_now().is_zero() {
@@ -124,7 +161,13 @@ impl Keeper {
         if running.since.elapsed() > GOOD_RUN {
             self.pause = FIRST_PAUSE;
         }
-        tracing::warn!(camera = %self.place.camera, pid = running.pid, "its process {end}");
+        let owner = &self.program.owner;
+        tracing::warn!(
+            camera = owner.camera(),
+            program = owner.program(),
+            pid = running.pid,
+            "its process {end}"
+        );
         self.not_before = HostTime::now().plus(self.pause);
         self.pause = (self.pause * 2).min(LONGEST_PAUSE);
         self.last_end = Some(end);
@@ -133,14 +176,14 @@ impl Keeper {
     fn start(&self) -> Result<Running> {
         let shared = Arc::new(Shared::default());
         let (report, reported) = sync_channel(1);
-        let config = self.config.clone();
-        let place = self.place.clone();
+        let program = self.program.clone();
         let theirs = Arc::clone(&shared);
         let thread = std::thread::Builder::new()
-            .name(format!("proc-{}", self.place.camera))
-            .spawn(move || keep(&config, &place, &theirs, &report))
+            .name(format!("proc-{}", self.program.owner.name()))
+            .spawn(move || keep(&program, &theirs, &report))
             .map_err(|e| Error::new(ErrorKind::Io, "no thread for its process").with_source(e))?;
-        let program = self.config.command.first().map_or("", String::as_str);
+        let Program { owner, command, directory, .. } = &self.program;
+        let program = command.first().map_or("", String::as_str);
         let pid = reported
             .recv()
             .map_err(|e| {
@@ -152,11 +195,11 @@ impl Keeper {
                     Io::NotFound | Io::PermissionDenied | Io::NotADirectory => ErrorKind::BadInput,
                     _ => ErrorKind::Io,
                 };
-                let place = self.config.directory.display();
+                let place = directory.display();
                 Error::new(kind, format!("\"{program}\" of `command` could not be started in {place}: {e}"))
                     .with_source(e)
             })?;
-        tracing::info!(camera = %self.place.camera, pid, program, "started the process of the camera");
+        tracing::info!(camera = owner.camera(), program = owner.program(), pid, "started \"{program}\"");
         Ok(Running { pid, since: HostTime::now(), shared, thread: Some(thread) })
     }
 }
@@ -172,8 +215,8 @@ impl Drop for Keeper {
 }
 
 /// The thread of a process: starts it, waits for its end, ends it when asked to.
-fn keep(config: &ExternalConfig, place: &Place, shared: &Shared, report: &SyncSender<std::io::Result<u32>>) {
-    let mut child = match spawn(config, place) {
+fn keep(program: &Program, shared: &Shared, report: &SyncSender<std::io::Result<u32>>) {
+    let mut child = match spawn(program) {
         Ok(child) => child,
         Err(e) => {
             let _ = report.send(Err(e));
@@ -181,7 +224,7 @@ fn keep(config: &ExternalConfig, place: &Place, shared: &Shared, report: &SyncSe
         }
     };
     let pid = child.id();
-    copy_output(&mut child, place, pid);
+    copy_output(&mut child, &program.owner, pid);
     let _ = report.send(Ok(pid));
     let mut term_until = None;
     let end = loop {
@@ -221,16 +264,15 @@ fn describe(status: ExitStatus) -> String {
     }
 }
 
-fn spawn(config: &ExternalConfig, place: &Place) -> std::io::Result<Child> {
-    let (program, arguments) = config.command.split_first().ok_or(std::io::ErrorKind::InvalidInput)?;
+fn spawn(program: &Program) -> std::io::Result<Child> {
+    let Program { command, directory, environment, .. } = program;
+    let (program, arguments) = command.split_first().ok_or(std::io::ErrorKind::InvalidInput)?;
     let daemon = std::process::id();
     let mut command = Command::new(program);
     command
         .args(arguments)
-        .current_dir(&config.directory)
-        .env(RUNTIME_DIR_VARIABLE, place.runtime.path())
-        .env(RIG_VARIABLE, place.rig.as_str())
-        .env(CAMERA_VARIABLE, place.camera.as_str())
+        .current_dir(directory)
+        .envs(environment.iter().map(|(name, value)| (name, value)))
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
@@ -254,16 +296,19 @@ fn spawn(config: &ExternalConfig, place: &Place) -> std::io::Result<Child> {
 }
 
 /// Threads that bring what the process prints into the log; they end with its output.
-fn copy_output(child: &mut Child, place: &Place, pid: u32) {
+fn copy_output(child: &mut Child, owner: &Owner, pid: u32) {
     let out = child.stdout.take().map(|o| Box::new(o) as Box<dyn std::io::Read + Send>);
     let err = child.stderr.take().map(|e| Box::new(e) as Box<dyn std::io::Read + Send>);
     for pipe in [out, err].into_iter().flatten() {
-        let camera = place.camera.clone();
-        let copied = std::thread::Builder::new()
-            .name(format!("log-{camera}"))
-            .spawn(move || log::copy(pipe, |line| tracing::info!(camera = %camera, pid, "{line}")));
-        if let Err(e) = copied {
-            tracing::warn!(camera = %place.camera, error = %e, "what its process prints cannot be read");
+        let of_thread = owner.clone();
+        let copy = move || {
+            log::copy(pipe, |line| {
+                tracing::info!(camera = of_thread.camera(), program = of_thread.program(), pid, "{line}");
+            });
+        };
+        if let Err(e) = std::thread::Builder::new().name(format!("log-{}", owner.name())).spawn(copy) {
+            let (camera, program) = (owner.camera(), owner.program());
+            tracing::warn!(camera, program, error = %e, "what its process prints cannot be read");
         }
     }
 }
