@@ -99,15 +99,20 @@ function signals(status, { bad }) {
 }
 
 /**
- * The clock of the session, and the other computers of the rig.
+ * The clock of the session, the other computers of the rig, and the program for ROS 2.
  *
  * @param {Status} status
  * @param {{bad: string[], good: string[]}} lists
  */
 function computers(status, { bad, good }) {
   const { link } = status;
-  if (link && (link.state === "silent" || link.state === "unknown")) {
+  if (link && link.state === "unkeyed") {
+    bad.push(`${link.recorder ?? "the session"} has not given the key of its clock yet`);
+  } else if (link && link.state !== "own" && link.state !== "live") {
     bad.push(`the clock of ${link.recorder ?? "the session"} does not answer`);
+  }
+  if (status.ros2 && status.ros2.pid === null) {
+    bad.push(`ROS 2: ${status.ros2.why ?? "it does not run"}`);
   }
   const hosts = status.hosts?.hosts ?? [];
   for (const { host, state, why, cameras, streaming, has_clock } of hosts) {

@@ -128,7 +128,7 @@
  * @typedef {Object} LinkStatus the clock of the session, in a rig of several computers
  * @property {string} host
  * @property {string | null} recorder
- * @property {"own" | "live" | "silent" | "unknown"} state
+ * @property {"own" | "live" | "silent" | "unknown" | "unkeyed"} state
  *
  * @typedef {Object} HostStatus another computer of the rig
  * @property {string} host
@@ -150,6 +150,7 @@
  * @property {SignalStatus[]} [signals]
  * @property {LinkStatus | null} [link]
  * @property {HostsStatus | null} [hosts]
+ * @property {{pid: number | null, why: string | null} | null} [ros2] the program that publishes the rig to ROS 2
  * @property {SetStatus} sets
  * @property {RecordingStatus | null} recording
  * @property {number} cpu_cores

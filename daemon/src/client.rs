@@ -10,7 +10,7 @@ use crate::api::{
     self, BytesRequest, FileDigest, FileRequest, LoopRequest, NoteRequest, PageAddress, RateRequest,
     RecordingFiles, StepRequest,
 };
-use crate::control::{EpisodeRequest, GridRequest, GridStreams, RecordRequest, SeekRequest};
+use crate::control::{EpisodeRequest, FollowRequest, GridStreams, RecordRequest, SeekRequest};
 use crate::status::{RecordingStatus, ReplayStatus, RigStatus};
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
@@ -146,12 +146,12 @@ impl Client {
         self.get("/v1/record")
     }
 
-    /// Moves the ticks there, and returns the streams that they are chosen for.
+    /// Gives the key and the ticks of the session, and returns the streams that the ticks are chosen for.
     ///
     /// # Errors
-    /// As [`Self::status`] and [`crate::control::Control::follow_grid`].
-    pub fn follow_grid(&self, request: &GridRequest) -> Result<GridStreams> {
-        self.post("/v1/sets/grid", request, self.timeout())
+    /// As [`Self::status`] and [`crate::control::Control::follow`].
+    pub fn follow(&self, request: &FollowRequest) -> Result<GridStreams> {
+        self.post("/v1/session/follow", request, self.timeout())
     }
 
     /// Adds a timed note to the recording.

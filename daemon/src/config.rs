@@ -12,6 +12,7 @@ pub(crate) mod pose;
 pub(crate) mod read;
 mod refine;
 mod rig;
+mod ros2;
 pub(crate) mod stereo;
 #[cfg(test)]
 mod tests;
@@ -71,6 +72,8 @@ pub struct RigConfig {
     pub signals: Vec<SignalConfig>,
     /// Its part in a rig of several computers.
     pub link: Option<LinkConfig>,
+    /// The program that publishes the rig to ROS 2.
+    pub ros2: Option<Ros2Config>,
     /// The file's text.
     pub text: String,
     /// The file, if it came from one; absolute.
@@ -84,8 +87,19 @@ pub struct LinkConfig {
     pub host: Name,
     /// Its role there.
     pub role: LinkRole,
+    /// Packets of the clock are not signed.
+    pub insecure: bool,
     /// The other computers, which record when this one does.
     pub hosts: Vec<HostConfig>,
+}
+
+/// The program that publishes the rig to ROS 2, which the daemon starts.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Ros2Config {
+    /// The program and its arguments; empty: `depthrig-ros2`, of the Python environment that this program is in, or found by `PATH`.
+    pub command: Vec<String>,
+    /// Where it runs.
+    pub directory: PathBuf,
 }
 
 /// Another computer of the rig, as the one that records reaches it.

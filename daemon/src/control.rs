@@ -9,7 +9,7 @@ use depthrig_bus::{HostTime, RigName, RuntimeDir, UtcPair};
 use depthrig_calibrate::file::CalibratedCamera;
 use depthrig_calibrate::mount::UncertaintyMap;
 use depthrig_driver::controls::ControlValue;
-use depthrig_link::Reading;
+use depthrig_link::{Key, Reading};
 use depthrig_recorder::{Episode, EpisodeOutcome, Mark, RecorderOptions, Session};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -101,11 +101,11 @@ pub trait Control: Send + Sync {
     /// `WrongState` when none is going on.
     fn record_stop(&self) -> Result<RecordingStatus>;
 
-    /// Moves the ticks to the phase of the computer that records the session, and says which streams there are.
+    /// Takes the key and the ticks of the computer that records the session, and says which streams there are.
     ///
     /// # Errors
     /// `WrongState` of a rig whose clock is that of the session, or that has no other computers.
-    fn follow_grid(&self, _: &GridRequest) -> Result<GridStreams> {
+    fn follow(&self, _: &FollowRequest) -> Result<GridStreams> {
         let what = "this rig follows the clock of no other computer ([link] with recorder in its rig file)";
         Err(Error::new(ErrorKind::WrongState, what))
     }
@@ -152,11 +152,14 @@ pub trait Control: Send + Sync {
     }
 }
 
-/// Where the ticks of a session of several computers lie.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+/// Key and ticks of the computer that records a session, for the others.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct GridRequest {
-    /// Nanoseconds after a whole period on the clock of the session.
+pub struct FollowRequest {
+    /// Signs the packets of its clock; none if nobody signs them.
+    #[serde(default)]
+    pub key: Option<Key>,
+    /// Where the ticks lie: nanoseconds after a whole period on its clock.
     pub phase_ns: i64,
 }
 

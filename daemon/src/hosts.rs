@@ -23,7 +23,7 @@ mod visit;
 
 use crate::client::Client;
 use crate::config::{HostConfig, Reach, RigConfig};
-use crate::control::{GridRequest, RecordRequest};
+use crate::control::{FollowRequest, RecordRequest};
 use crate::mirror::Mirror;
 use crate::recording::reserve_bytes;
 use crate::sets::Grid;
@@ -33,7 +33,7 @@ use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::sync::lock;
 use depthrig_bus::{HostTime, RigName, RuntimeDir};
-use depthrig_link::{Remote, Tunnel};
+use depthrig_link::{Key, Remote, Tunnel};
 use depthrig_recorder::fs::RealFs;
 use depthrig_recorder::{Health, SESSION_FILE, look_at};
 use refine::HostRefine;
@@ -48,6 +48,10 @@ pub type JoinParts = fn(&[PathBuf], &Path, &RuntimeDir, &AtomicBool) -> Result<u
 
 /// From one look at a host to the next while nothing is pulled from it.
 const LOOK: Duration = Duration::from_millis(500);
+/// A host that was just reached gets the key of the clock first, and begins its part when it knows the clock, or after so long all the same.
+const CLOCK_WAIT: Duration = Duration::from_secs(2);
+/// From one look to the next meanwhile.
+const CLOCK_LOOK: Duration = Duration::from_millis(100);
 /// A start and a stop wait so long for the hosts that answer; they go on behind it.
 const SETTLE_TIMEOUT: Duration = Duration::from_secs(5);
 
@@ -82,6 +86,8 @@ pub struct Hosts {
     reserve_bytes: u64,
     join: Option<JoinParts>,
     grid: Arc<Grid>,
+    /// The others sign the packets of the clock with it; none if nobody does.
+    key: Option<Key>,
 }
 
 #[derive(Debug)]
@@ -126,6 +132,7 @@ impl Hosts {
         runtime: &RuntimeDir,
         join: Option<JoinParts>,
         grid: Arc<Grid>,
+        key: Option<Key>,
     ) -> Result<Option<Self>> {
         let Some(link) = config.link.as_ref().filter(|link| !link.hosts.is_empty()) else { return Ok(None) };
         for host in &link.hosts {
@@ -171,6 +178,7 @@ impl Hosts {
             reserve_bytes: reserve_bytes(&config.recording),
             join,
             grid,
+            key,
         }))
     }
 
@@ -237,6 +245,7 @@ impl Hosts {
         let Some(host) = self.others.get(number) else { return Ok(()) };
         let client = Client::of_host(&self.runtime, &self.rig, &host.config.name)?;
         let tunnel = self.tunnel(host)?;
+        let mut connected_since = None;
         while !stop.load(Ordering::Relaxed) {
             let mut sessions = lock(&self.sessions);
             // Under the lock: a session is added after its recording has become active.
@@ -244,22 +253,26 @@ impl Hosts {
             drop(sessions);
             let looked = client.status();
             let is_new = self.note(host, looked.as_ref(), tunnel.as_ref());
-            let is_busy = match &looked {
-                Ok(status) if host.is_connected() => self.visit(host, &client, status, stop),
-                _ => false,
-            };
-            self.share_grid(host, &client);
+            let mut is_busy = false;
+            let mut may_begin = true;
             if let Ok(status) = &looked
                 && host.is_connected()
             {
+                self.lead(host, &client);
+                let since = *connected_since.get_or_insert_with(HostTime::now);
+                may_begin = lock(&host.seen).has_clock || since.elapsed() >= CLOCK_WAIT;
+                is_busy = self.visit(host, &client, status, may_begin, stop);
                 host.begin_refined(status, place);
+            } else {
+                connected_since = None;
             }
             if is_new {
                 self.changed.notify_all();
             }
             if !is_busy {
                 let sessions = lock(&self.sessions);
-                drop(self.changed.wait_timeout(sessions, LOOK).unwrap_or_else(PoisonError::into_inner));
+                let pause = if may_begin { LOOK } else { CLOCK_LOOK };
+                drop(self.changed.wait_timeout(sessions, pause).unwrap_or_else(PoisonError::into_inner));
             }
         }
         Ok(())
@@ -281,17 +294,10 @@ impl Hosts {
         mirror.run(&|| host.is_connected(), wake, stop)
     }
 
-    /// Says where the ticks lie, and hears of the streams there.
-    fn share_grid(&self, host: &Host, client: &Client) {
-        let is_there = {
-            let seen = lock(&host.seen);
-            seen.state == HostState::Connected && seen.has_clock
-        };
-        if !is_there {
-            return;
-        }
-        let phase_ns = self.grid.phase_ns();
-        if let Ok(heard) = client.follow_grid(&GridRequest { phase_ns }) {
+    /// Gives the key and the ticks, and hears of the streams there.
+    fn lead(&self, host: &Host, client: &Client) {
+        let request = FollowRequest { key: self.key.clone(), phase_ns: self.grid.phase_ns() };
+        if let Ok(heard) = client.follow(&request) {
             self.grid.set_other(host.config.name.as_str(), heard.streams);
         }
     }
@@ -373,6 +379,12 @@ impl Hosts {
         if link.recorder.is_none() {
             return Some(
                 "its rig file has listen in [link]; a session has one computer with listen".to_owned(),
+            );
+        }
+        if link.insecure != self.key.is_none() {
+            return Some(
+                "only one of both has insecure = true in [link]; write it into both rig files, or into neither"
+                    .to_owned(),
             );
         }
         let twice = |names: &[String]| cameras.iter().find(|c| names.contains(c)).cloned();

@@ -25,6 +25,7 @@ mod priority;
 mod recording;
 pub mod replay;
 pub mod rig;
+mod ros2;
 pub mod sets;
 mod showing;
 mod sink;

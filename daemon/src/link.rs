@@ -1,6 +1,9 @@
 //! The clock of a session of several computers: asked for or answered, published as a signal, so that a recording has it, and read from
 //! recordings.
 //!
+//! Its packets are signed with a key that the recorder's daemon makes anew each time it starts, and gives to the others over their control
+//! connections ([`crate::hosts`]), which OpenSSH protects.
+//!
 //! Each computer publishes the signal `HOST/link_clock` ten times a second: what the session's clock said at that moment, and how wrong that may
 //! be. Its values are recorded like those of any other signal, and put the frames of all computers on one clock when their datasets are
 //! joined ([`crate::replay`]).
@@ -15,7 +18,7 @@ use depthrig_bus::{
     SignalSample, Signals, Value,
 };
 use depthrig_link::identity::of_this_clock;
-use depthrig_link::{Answerer, Asker, Reading};
+use depthrig_link::{Answerer, Asker, Key, Reading, Trust};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// From one sample to the next.
@@ -40,7 +43,7 @@ pub struct Link {
 
 #[derive(Debug)]
 enum Role {
-    Recorder { answerer: Answerer, clock: u64 },
+    Recorder { answerer: Answerer, clock: u64, key: Option<Key> },
     Camera(Asker),
 }
 
@@ -68,14 +71,43 @@ impl Link {
                 let clock = of_this_clock().map_err(|e| failed(e, "this computer's clock".to_owned()))?;
                 let what =
                     || format!("UDP {at} is refused; listen in [link] must be an address of this computer");
-                Role::Recorder { answerer: Answerer::start(at).map_err(|e| failed(e, what()))?, clock }
+                let key = (!config.insecure)
+                    .then(Key::random)
+                    .transpose()
+                    .map_err(|e| failed(e, "no key for the clock".to_owned()))?;
+                let trust = key.clone().map_or(Trust::Anyone, Trust::Key);
+                Role::Recorder {
+                    answerer: Answerer::start(at, trust).map_err(|e| failed(e, what()))?,
+                    clock,
+                    key,
+                }
             }
             LinkRole::Camera(at) => {
                 let what = || format!("no thread asks for the clock of {at}");
-                Role::Camera(Asker::start(at).map_err(|e| failed(e, what()))?)
+                let trust = if config.insecure { Trust::Anyone } else { Trust::Nobody };
+                Role::Camera(Asker::start(at, trust).map_err(|e| failed(e, what()))?)
             }
         };
         Ok(Self { config: config.clone(), role })
+    }
+
+    /// The key that the other computers get; `None` if this one records no session, or signs nothing.
+    pub fn key(&self) -> Option<Key> {
+        match &self.role {
+            Role::Recorder { key, .. } => key.clone(),
+            Role::Camera(_) => None,
+        }
+    }
+
+    /// Takes the key of the computer that records the session; `false` on that computer.
+    pub fn follow(&self, key: Option<&Key>) -> bool {
+        let Role::Camera(asker) = &self.role else { return false };
+        if let Some(key) = key
+            && !self.config.insecure
+        {
+            asker.set_key(key.clone());
+        }
+        true
     }
 
     /// The session's clock at a time of this computer's; `None` if it is this computer's, or not known yet.
@@ -92,6 +124,7 @@ impl Link {
         match &self.role {
             Role::Recorder { answerer, .. } => LinkStatus {
                 host,
+                insecure: self.config.insecure,
                 recorder: None,
                 state: LinkState::Own,
                 offset_s: Some(0.0),
@@ -107,19 +140,22 @@ impl Link {
                 let s = asker.state();
                 let reading = asker.at(now);
                 let age_ns = now.since_ns(s.last_answer);
+                let is_refused = now.since_ns(s.last_refusal) <= SILENT_NS;
                 LinkStatus {
                     host,
+                    insecure: self.config.insecure,
                     recorder: Some(asker.address().to_string()),
                     state: match reading {
+                        Some(_) if age_ns <= SILENT_NS => LinkState::Live,
+                        _ if is_refused => LinkState::Unkeyed,
+                        Some(_) => LinkState::Silent,
                         None => LinkState::Unknown,
-                        Some(_) if age_ns > SILENT_NS => LinkState::Silent,
-                        Some(_) => LinkState::Live,
                     },
                     offset_s: reading.map(|r| r.offset_ns as f64 / 1e9),
                     uncertainty_us: reading.map(|r| r.uncertainty_ns as f64 / 1e3),
                     rate_ppm: reading.map(|r| r.rate * 1e6),
                     epoch: reading.map(|r| r.epoch),
-                    round_trip_us: reading.map(|_| s.round_trip_ns as f64 / 1e3),
+                    round_trip_us: (reading.is_some() || is_refused).then_some(s.round_trip_ns as f64 / 1e3),
                     age_s: reading.map(|_| age_ns as f64 / 1e9),
                     exchanges: s.asked,
                     refused: s.refused,
@@ -205,6 +241,9 @@ fn log(status: &LinkStatus, state: &mut LinkState) {
             "the clock of {recorder} answers: {:+.6} s from this one within {:.0} us",
             status.offset_s.unwrap_or_default(),
             status.uncertainty_us.unwrap_or_default()
+        ),
+        LinkState::Unkeyed => tracing::warn!(
+            "{recorder} answers, and has not given the key of its clock to this computer yet; capture and recording go on"
         ),
         LinkState::Own | LinkState::Unknown => {}
     }

@@ -338,6 +338,7 @@ fn recording_config(sources: &mut Sources) -> RigConfig {
         signals: Vec::new(),
         cameras: Vec::new(),
         link: None,
+        ros2: None,
         text: sources.session().rig_config.clone(),
         path: None,
     }

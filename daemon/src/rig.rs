@@ -28,6 +28,7 @@ use crate::family::Preparation;
 use crate::hosts::{Hosts, JoinParts, Place};
 use crate::link::Link;
 use crate::recording::{Outside, Recording, Reports, recover_left};
+use crate::ros2::Ros2;
 use crate::sets::{Grid, SpreadStats};
 use crate::stage::{Intake, Stage};
 use crate::status::{CameraState, RigStatus, SetAccount};
@@ -160,6 +161,8 @@ pub struct Inner {
     link: Option<Arc<Link>>,
     /// The other computers, on the one that records.
     hosts: Option<Arc<Hosts>>,
+    /// The program that publishes the rig to ROS 2.
+    ros2: Option<Arc<Ros2>>,
     /// Where the ticks of all computers lie.
     grid: Arc<Grid>,
 }
@@ -197,7 +200,7 @@ impl Rig {
             plan(&config, drawing)?;
         }
         let shared = Arc::new(Shared {
-            drawing: drawing.clone(),
+            drawing,
             memory_share: shm::free_bytes(shm::SHM_DIR.as_ref())? / config.cameras.len().max(1) as u64,
             slots: config.bus.slots,
             began: HostTime::now(),
@@ -208,7 +211,9 @@ impl Rig {
         });
         let link = config.link.as_ref().map(Link::start).transpose()?.map(Arc::new);
         let grid = Arc::<Grid>::default();
-        let hosts = Hosts::new(&config, &options.runtime, options.join, Arc::clone(&grid))?.map(Arc::new);
+        let key = link.as_ref().and_then(|link| link.key());
+        let hosts = Hosts::new(&config, &options.runtime, options.join, Arc::clone(&grid), key)?;
+        let ros2 = config.ros2.as_ref().map(|ros2| Arc::new(Ros2::new(ros2, &config.rig, &options.runtime)));
         let late_after_ns = live_late_ns((1e9 / config.sets.rate_hz) as i64);
         let inner = Arc::new(Inner {
             cameras: config.cameras.iter().map(|c| Arc::new(Camera::new(c.clone()))).collect(),
@@ -236,7 +241,8 @@ impl Rig {
             runtime: options.runtime.clone(),
             held_sets: AtomicUsize::new(0),
             link,
-            hosts,
+            hosts: hosts.map(Arc::new),
+            ros2,
             grid,
         });
         let assembly = Assembly::new(Arc::clone(&inner))?;
@@ -264,6 +270,7 @@ impl Rig {
             rig.spawn("link", move |stop| publisher.run(&link, stop))?;
         }
         rig.keep_hosts()?;
+        rig.keep_ros2()?;
         let inner = Arc::clone(&rig.inner);
         rig.spawn("housekeeping", move |stop| housekeeping(&inner, stop))?;
         if rig.inner.config.recording.recover_on_start {
@@ -271,13 +278,7 @@ impl Rig {
             let recover = move |stop: &AtomicBool| recover_left(&inner.config, &inner.outside.fs, stop);
             rig.recovery = Some(start_thread("recover", recover)?);
         }
-        if let Some(drawing) = drawing {
-            rig.spawn("draw", move |stop| {
-                if let Err(e) = drawing.run(stop) {
-                    tracing::error!("the images of synthetic cameras stay coarse: {e}");
-                }
-            })?;
-        }
+        rig.draw()?;
         rig.wait_for_cameras()?;
         Ok(rig)
     }
@@ -393,6 +394,21 @@ impl Rig {
             })?;
         }
         self.spawn("join", move |stop| hosts.join_complete(stop))
+    }
+
+    fn keep_ros2(&mut self) -> Result<()> {
+        let Some(ros2) = self.inner.ros2.clone() else { return Ok(()) };
+        self.spawn("ros2", move |stop| ros2.run(stop))
+    }
+
+    /// Renders the scenes of simulated cameras, if that is left for the time after the start.
+    fn draw(&mut self) -> Result<()> {
+        let Some(drawing) = self.inner.shared.drawing.clone() else { return Ok(()) };
+        self.spawn("draw", move |stop| {
+            if let Err(e) = drawing.run(stop) {
+                tracing::error!("the images of synthetic cameras stay coarse: {e}");
+            }
+        })
     }
 
     /// Reports too little shared memory once, for all cameras together.

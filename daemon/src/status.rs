@@ -37,6 +37,9 @@ pub struct RigStatus {
     /// The other computers, on the one that records.
     #[serde(default)]
     pub hosts: Option<HostsStatus>,
+    /// The program that publishes the rig to ROS 2, if the daemon starts one.
+    #[serde(default)]
+    pub ros2: Option<Ros2Status>,
     /// The set assembler.
     pub sets: SetStatus,
     /// The recording in progress, or the last one.
@@ -66,11 +69,22 @@ pub struct SignalStatus {
     pub missed: u64,
 }
 
+/// The program that publishes the rig to ROS 2.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Ros2Status {
+    /// Its process; `None` while it does not run.
+    pub pid: Option<u32>,
+    /// Why it does not run.
+    pub why: Option<String>,
+}
+
 /// The clock of a session of several computers, as this one knows it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LinkStatus {
     /// Name of this computer in the rig.
     pub host: String,
+    /// The packets of the clock are not signed.
+    pub insecure: bool,
     /// The computer whose clock is that of the session; `None` if it is this one.
     pub recorder: Option<String>,
     /// Whether it answers.
@@ -83,7 +97,7 @@ pub struct LinkStatus {
     pub rate_ppm: Option<f64>,
     /// Counts steps of the clocks.
     pub epoch: Option<u32>,
-    /// Time on the way of the newest answer, both ways together, microseconds.
+    /// Time on the way of the newest answer or refusal, both ways together, microseconds.
     pub round_trip_us: Option<f64>,
     /// How long ago the newest answer came, seconds.
     pub age_s: Option<f64>,
@@ -105,6 +119,8 @@ pub enum LinkState {
     Silent,
     /// There was no answer yet.
     Unknown,
+    /// It answers, but not this computer, which has not been given its key yet.
+    Unkeyed,
 }
 
 /// Whether samples of a signal come.

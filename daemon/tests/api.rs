@@ -152,7 +152,7 @@ const EPISODES: [(&str, u16); 5] = [
 const WITHOUT_CAMERAS: [(&str, &str); 9] = [
     ("/v1/recordings/mark", r#"{"name": "x", "mark": "bad"}"#),
     ("/v1/recordings/report", r#"{"name": "x"}"#),
-    ("/v1/sets/grid", r#"{"phase_ns": 7}"#),
+    ("/v1/session/follow", r#"{"key": "000102030405060708090a0b0c0d0e0f", "phase_ns": 7}"#),
     ("/v1/recordings/files", r#"{"name": "x"}"#),
     ("/v1/recordings/bytes", r#"{"name": "x", "file": "session.toml", "offset": 0, "length": 1}"#),
     ("/v1/recordings/digest", r#"{"name": "x", "file": "session.toml"}"#),

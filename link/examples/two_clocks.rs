@@ -5,7 +5,7 @@
 
 use core::time::Duration;
 use depthrig_bus::HostTime;
-use depthrig_link::{Answerer, Asker};
+use depthrig_link::{Answerer, Asker, Trust};
 use std::error::Error;
 use std::io::{self, Read, Write};
 
@@ -13,7 +13,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     match arguments.iter().map(String::as_str).collect::<Vec<_>>().as_slice() {
         ["answer", address] => {
-            let answerer = Answerer::start(address.parse()?)?;
+            let answerer = Answerer::start(address.parse()?, Trust::Anyone)?;
             println!("{}", answerer.address());
             // Until the one who started this closes its input.
             io::stdin().read_to_end(&mut Vec::new())?;
@@ -26,7 +26,7 @@ fn main() -> Result<(), Box<dyn Error>> {
 }
 
 fn ask(address: &str, seconds: f64) -> Result<(), Box<dyn Error>> {
-    let asker = Asker::start(address.parse()?)?;
+    let asker = Asker::start(address.parse()?, Trust::Anyone)?;
     let mut out = io::BufWriter::new(io::stdout().lock());
     let end = HostTime::now().plus(Duration::from_secs_f64(seconds));
     while HostTime::now() < end {

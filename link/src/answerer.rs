@@ -1,8 +1,9 @@
 //! Answers other hosts' questions about this host's clock.
 
 use crate::identity::of_this_clock;
+use crate::key::Trust;
 use crate::stamped::Stamped;
-use crate::wire::{Answer, LENGTH, Question};
+use crate::wire::{Answer, LENGTH, Question, Refusal, is_trusted};
 use crate::worker::Worker;
 use core::time::Duration;
 use depthrig_bus::HostTime;
@@ -13,7 +14,8 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 /// The thread looks this often whether to stop.
 const LOOK: Duration = Duration::from_millis(100);
-/// Questions of all hosts that are answered in a second: fifty hosts at 20 Hz. A flood costs no more than that.
+/// Questions of all hosts that are answered in a second: fifty hosts at 20 Hz. A flood costs no more than that, and one of strangers takes
+/// nothing from those who are trusted.
 const PER_SECOND: u64 = 1000;
 
 /// A thread that answers until this is dropped.
@@ -31,11 +33,11 @@ struct Counts {
 }
 
 impl Answerer {
-    /// Answers on `address`; port 0 chooses one.
+    /// Answers those whom it trusts on `address`; port 0 chooses one. Others hear that they are not.
     ///
     /// # Errors
     /// When the address cannot be listened on, or no thread can be started.
-    pub fn start(address: SocketAddr) -> io::Result<Self> {
+    pub fn start(address: SocketAddr, trust: Trust) -> io::Result<Self> {
         let socket = UdpSocket::bind(address)?;
         socket.set_read_timeout(Some(LOOK))?;
         let address = socket.local_addr()?;
@@ -43,7 +45,8 @@ impl Answerer {
         let clock = of_this_clock()?;
         let counts = Arc::new(Counts::default());
         let of_thread = Arc::clone(&counts);
-        let thread = Worker::start("link_answers", move |stop| answer(socket, clock, &of_thread, stop))?;
+        let thread =
+            Worker::start("link_answers", move |stop| answer(socket, clock, &trust, &of_thread, stop))?;
         Ok(Self { counts, address, _thread: thread })
     }
 
@@ -57,16 +60,16 @@ impl Answerer {
         self.counts.answered.load(Ordering::Relaxed)
     }
 
-    /// Packets that were no question, or came above the limit.
+    /// Packets that were no question or a stranger's, or came above the limit.
     pub fn refused(&self) -> u64 {
         self.counts.refused.load(Ordering::Relaxed)
     }
 }
 
-fn answer(mut socket: Stamped, clock: u64, counts: &Counts, stop: &AtomicBool) {
+fn answer(mut socket: Stamped, clock: u64, trust: &Trust, counts: &Counts, stop: &AtomicBool) {
     let mut buffer = [0; LENGTH];
     let mut second = HostTime::now();
-    let mut in_second = 0;
+    let (mut of_trusted, mut of_strangers) = (0, 0);
     while !stop.load(Ordering::Relaxed) {
         let received = match socket.receive(&mut buffer) {
             Ok(Some(received)) => received,
@@ -79,17 +82,28 @@ fn answer(mut socket: Stamped, clock: u64, counts: &Counts, stop: &AtomicBool) {
             }
         };
         if received.at.since_ns(second) >= 1_000_000_000 {
-            (second, in_second) = (received.at, 0);
+            (second, of_trusted, of_strangers) = (received.at, 0, 0);
         }
-        in_second += 1;
-        let question = buffer.get(..received.length).and_then(Question::from_bytes);
-        let (Some(question), Some(from), true) = (question, received.from, in_second <= PER_SECOND) else {
+        let packet = buffer.get(..received.length).unwrap_or_default();
+        let (Some(Question { nonce }), Some(from)) = (Question::from_bytes(packet), received.from) else {
             counts.refused.fetch_add(1, Ordering::Relaxed);
             continue;
         };
-        let answer = Answer { nonce: question.nonce, clock, t2: received.at.ns(), t3: HostTime::now().ns() };
-        // An answer that cannot be sent is one that is lost.
-        let _ = socket.socket().send_to(&answer.to_bytes(), from);
-        counts.answered.fetch_add(1, Ordering::Relaxed);
+        let is_trusted = is_trusted(packet, trust);
+        let in_second = if is_trusted { &mut of_trusted } else { &mut of_strangers };
+        *in_second += 1;
+        let is_answered = *in_second <= PER_SECOND;
+        let count = if is_trusted && is_answered { &counts.answered } else { &counts.refused };
+        count.fetch_add(1, Ordering::Relaxed);
+        if is_answered {
+            let answer = if is_trusted {
+                let (t2, t3) = (received.at.ns(), HostTime::now().ns());
+                Answer { nonce, clock, t2, t3 }.to_bytes(trust)
+            } else {
+                Refusal { nonce }.to_bytes()
+            };
+            // An answer that cannot be sent is one that is lost.
+            let _ = socket.socket().send_to(&answer, from);
+        }
     }
 }

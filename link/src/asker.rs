@@ -1,8 +1,9 @@
 //! Asks another host for its clock, and keeps the offset.
 
 use crate::corridor::{Corridor, Estimate, Exchange, Reading, Taken};
+use crate::key::{Key, Trust};
 use crate::stamped::Stamped;
-use crate::wire::{Answer, LENGTH, Question};
+use crate::wire::{Answer, LENGTH, Question, Refusal, is_trusted};
 use crate::worker::Worker;
 use core::time::Duration;
 use depthrig_bus::{HostTime, sync::lock};
@@ -27,13 +28,17 @@ pub struct AskerState {
     pub asked: u64,
     /// Answers that were of use.
     pub answered: u64,
-    /// Packets that were no answer to a question of ours, came twice, or contradict themselves.
+    /// Packets that were no answer to a question of ours, not signed by the key, came twice, or contradict themselves.
     pub refused: u64,
+    /// Questions that the other host did not believe: its key is another one, or has not come here yet.
+    pub strange: u64,
+    /// When it last said so; 0 if it never did.
+    pub last_refusal: HostTime,
     /// Changes of a clock's rate that the corridor followed.
     pub bends: u64,
     /// Which clock answers ([`crate::identity`]); 0 before the first answer.
     pub clock: u64,
-    /// Time on the way of the newest answer, both ways together, nanoseconds.
+    /// Time on the way of the newest answer or refusal, both ways together, nanoseconds.
     pub round_trip_ns: i64,
     /// When the newest answer had arrived; 0 before the first.
     pub last_answer: HostTime,
@@ -48,20 +53,21 @@ pub struct Asker {
 }
 
 /// Whoever reads it waits for no computation.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct Shared {
     estimate: Option<Estimate>,
     state: AskerState,
+    trust: Trust,
 }
 
 impl Asker {
-    /// Asks the host at `address`, whether it answers yet, or can be reached yet, or not.
+    /// Asks the host at `address`, whether it answers yet, or can be reached yet, or not. Answers of others than `trust` are left out.
     ///
     /// # Errors
     /// When no thread can be started.
-    pub fn start(address: SocketAddr) -> io::Result<Self> {
+    pub fn start(address: SocketAddr, trust: Trust) -> io::Result<Self> {
         let random = File::open("/dev/urandom")?;
-        let shared = Arc::default();
+        let shared = Arc::new(Mutex::new(Shared { estimate: None, state: AskerState::default(), trust }));
         let asking = Asking {
             address,
             socket: None,
@@ -72,6 +78,11 @@ impl Asker {
         };
         let thread = Worker::start("link_clock", move |stop| asking.run(stop))?;
         Ok(Self { shared, address, _thread: thread })
+    }
+
+    /// Signs with `key` from now on, and believes answers that are signed by it alone.
+    pub fn set_key(&self, key: Key) {
+        lock(&self.shared).trust = Trust::Key(key);
     }
 
     /// The remote clock at a local time; none before the first answer.
@@ -125,8 +136,10 @@ impl Asking {
         if self.outstanding.len() == OUTSTANDING {
             self.outstanding.pop_front();
         }
-        let question = Question { nonce }.to_bytes();
-        lock(&self.shared).state.asked += 1;
+        let mut shared = lock(&self.shared);
+        let question = Question { nonce }.to_bytes(&shared.trust);
+        shared.state.asked += 1;
+        drop(shared);
         let sent = HostTime::now();
         self.outstanding.push_back((nonce, sent));
         socket.send(&question).map(drop)
@@ -152,11 +165,23 @@ impl Asking {
                 return false;
             }
         };
-        let answer = buffer.get(..received.length).and_then(Answer::from_bytes);
-        let asked = answer.and_then(|a| self.outstanding.iter().position(|(nonce, _)| *nonce == a.nonce));
-        let question = asked.and_then(|i| self.outstanding.remove(i));
-        let known = lock(&self.shared).state.clock;
-        let taken = answer.zip(question).map(|(a, (_, t1))| {
+        let packet = buffer.get(..received.length).unwrap_or_default();
+        if let Some(Refusal { nonce }) = Refusal::from_bytes(packet)
+            && let Some((_, sent)) = self.outstanding.iter().find(|(asked, _)| *asked == nonce)
+        {
+            // The question stays: who can read packets and not keep them back must not put a refusal before the answer.
+            let state = &mut lock(&self.shared).state;
+            state.strange += 1;
+            state.last_refusal = received.at;
+            state.round_trip_ns = received.at.since_ns(*sent);
+            return true;
+        }
+        let shared = lock(&self.shared);
+        let answer = Answer::from_bytes(packet).filter(|_| is_trusted(packet, &shared.trust));
+        let known = shared.state.clock;
+        drop(shared);
+        let asked = answer.and_then(|a| Some((a, self.asked(a.nonce)?)));
+        let taken = asked.map(|(a, t1)| {
             if a.clock != known {
                 // Another computer, or this one after a start: what the clock said before is of no use.
                 self.corridor.restart();
@@ -179,6 +204,12 @@ impl Asking {
             }
         }
         true
+    }
+
+    /// When the question with this number was sent, which has no answer yet; it has one then.
+    fn asked(&mut self, nonce: [u8; 16]) -> Option<HostTime> {
+        let at = self.outstanding.iter().position(|(asked, _)| *asked == nonce)?;
+        self.outstanding.remove(at).map(|(_, sent)| sent)
     }
 }
 
@@ -208,10 +239,19 @@ mod tests {
     #[test]
     fn a_host_may_come_late_go_and_come_back() {
         let place = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
-        let asker = Asker::start(place).unwrap();
+        let key = Key::random().unwrap();
+        let trust = Trust::Key(key.clone());
+        let asker = Asker::start(place, Trust::Nobody).unwrap();
         until(|| asker.state().asked >= 2);
         assert_eq!(asker.at(HostTime::now()), None);
-        let answerer = Answerer::start(place).unwrap();
+        let answerer = Answerer::start(place, trust.clone()).unwrap();
+        // It is there, but says nothing of its clock to strangers.
+        until(|| asker.state().strange >= 2);
+        asker.set_key(Key::random().unwrap());
+        let before = asker.state().strange;
+        until(|| asker.state().strange >= before + 3);
+        assert_eq!((asker.at(HostTime::now()), asker.state().answered, answerer.answered()), (None, 0, 0));
+        asker.set_key(key);
         until(|| asker.state().answered >= 5);
         let first = asker.at(HostTime::now()).unwrap();
         // It is the same clock.
@@ -219,7 +259,7 @@ mod tests {
         drop(answerer);
         let before = asker.state();
         until(|| asker.state().asked >= before.asked + 5);
-        let again = Answerer::start(place).unwrap();
+        let again = Answerer::start(place, trust).unwrap();
         until(|| asker.state().answered >= before.answered + 10);
         let back = asker.at(HostTime::now()).unwrap();
         assert_eq!(back.epoch, 1);
@@ -229,7 +269,7 @@ mod tests {
     #[test]
     fn a_host_without_a_route_is_asked_again_and_again() {
         // Nothing is sent to this network, which documents alone use; a computer without a route to it says so at once.
-        let asker = Asker::start("[2001:db8::1]:7447".parse().unwrap()).unwrap();
+        let asker = Asker::start("[2001:db8::1]:7447".parse().unwrap(), Trust::Anyone).unwrap();
         std::thread::sleep(Duration::from_millis(300));
         assert_eq!(asker.at(HostTime::now()), None);
     }
@@ -238,29 +278,41 @@ mod tests {
     fn packets_that_answer_nothing_are_counted_and_change_nothing() {
         let host = UdpSocket::bind("127.0.0.1:0").unwrap();
         host.set_read_timeout(Some(Duration::from_secs(30))).unwrap();
-        let asker = Asker::start(host.local_addr().unwrap()).unwrap();
+        let trust = Trust::Key(Key::random().unwrap());
+        let asker = Asker::start(host.local_addr().unwrap(), trust.clone()).unwrap();
         let mut buffer = [0; 100];
         let (length, from) = host.recv_from(&mut buffer).unwrap();
         let nonce = Question::from_bytes(&buffer[..length]).unwrap().nonce;
         let good = Answer { nonce, clock: 7, t2: 5, t3: 5 };
         let guessed = Answer { nonce: [1; 16], ..good };
         let untrue = Answer { t2: 9, ..good };
-        for packet in
-            [b"x".to_vec(), buffer.to_vec(), guessed.to_bytes().to_vec(), untrue.to_bytes().to_vec()]
-        {
+        let foreign = good.to_bytes(&Trust::Key(Key::random().unwrap()));
+        let signed = |answer: Answer| answer.to_bytes(&trust).to_vec();
+        // Who only sees the packets cannot answer, nor refuse in place of the answer.
+        for packet in [
+            b"x".to_vec(),
+            buffer.to_vec(),
+            foreign.to_vec(),
+            good.to_bytes(&Trust::Anyone).to_vec(),
+            Refusal { nonce: [1; 16] }.to_bytes().to_vec(),
+            Refusal { nonce }.to_bytes().to_vec(),
+            signed(guessed),
+            signed(untrue),
+        ] {
             host.send_to(&packet, from).unwrap();
         }
         // Its question is answered, although not with the truth.
-        host.send_to(&good.to_bytes(), from).unwrap();
-        until(|| asker.state().refused == 5);
+        host.send_to(&signed(good), from).unwrap();
+        until(|| asker.state().refused == 8);
+        assert_eq!(asker.state().strange, 1);
         assert_eq!(asker.at(HostTime::now()), None);
         // Another port of the same host is not heard.
-        UdpSocket::bind("127.0.0.1:0").unwrap().send_to(&good.to_bytes(), from).unwrap();
+        UdpSocket::bind("127.0.0.1:0").unwrap().send_to(&signed(good), from).unwrap();
         let (length, from) = host.recv_from(&mut buffer).unwrap();
         let nonce = Question::from_bytes(&buffer[..length]).unwrap().nonce;
-        host.send_to(&Answer { nonce, ..good }.to_bytes(), from).unwrap();
+        host.send_to(&signed(Answer { nonce, ..good }), from).unwrap();
         until(|| asker.state().answered == 1);
-        assert_eq!(asker.state().refused, 5);
+        assert_eq!(asker.state().refused, 8);
         assert!(asker.at(HostTime::now()).is_some());
     }
 }

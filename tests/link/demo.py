@@ -136,7 +136,7 @@ def split(config: str, right: Side, left: Side, ssh: str) -> None:
                 text += [f'directory = "{side.data}"', "min_minutes = 0"]
             elif line == "[control]":
                 text.append('tcp = "off"')
-        text += ["[link]", f'host = "{side.name}"', "insecure = true", link[side.name]]
+        text += ["[link]", f'host = "{side.name}"', link[side.name]]
         side.rig_file.write_text("\n".join(text) + "\n" + "".join(f"\n[[camera]]{camera}" for camera in parts[side.name]))
 
 

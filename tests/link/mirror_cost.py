@@ -34,7 +34,7 @@ RATE_HZ = 30.0
 ZENOH = f"tcp/{HERE}:7448"
 KEYS = {"color": 1280 * 720 * 3, "depth": 1280 * 720 * 2}
 TICKS = os.sysconf("SC_CLK_TCK")
-RIG = 'rig = "mount"\n[control]\ntcp = "off"\n[recording]\ndirectory = "{folder}/data"\nreserve_mb = 64\nmin_minutes = 0\n[link]\ninsecure = true\n'
+RIG = 'rig = "mount"\n[control]\ntcp = "off"\n[recording]\ndirectory = "{folder}/data"\nreserve_mb = 64\nmin_minutes = 0\n[link]\n'
 CAMERA = '[[camera]]\nname = "{name}"\nbackend = "synthetic"\nmodel = "d435"\ncheap = true\n' + "".join(
     f'[[camera.stream]]\nname = "{stream}"\nwidth = {{width}}\nheight = {{height}}\nrate_hz = {{rate}}\n' for stream in KEYS
 )

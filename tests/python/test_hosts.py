@@ -50,7 +50,7 @@ class Rig:
             "there": 'recorder = "10.77.0.1:7447"',
         }
         for host, name in NAMES.items():
-            lines = ['rig = "mount"', "[link]", f'host = "{name}"', "insecure = true", links[host]]
+            lines = ['rig = "mount"', "[link]", f'host = "{name}"', links[host]]
             lines += ["[control]", 'tcp = "off"', "[recording]", f'directory = "{self.data(host)}"']
             lines += ["reserve_mb = 64", "min_minutes = 0"]
             for camera in HOST_CAMERAS[host]:
@@ -354,14 +354,26 @@ def test_a_copy_that_was_damaged_is_pulled_again(rig: Rig) -> None:
     rig.start("here")
     rig.start("there")
     rig.ask("record", "start", "--name", "damaged")
-    copy = rig.data("here") / ".pulling" / "damaged_left" / "seg_0000.mcap.part"
-    wait_for("a copy", lambda: copy.exists() and copy.stat().st_size > 10_000)
-    with copy.open("r+b") as file:
-        file.seek(5_000)
-        file.write(b"damage")
+    pulling = rig.data("here") / ".pulling" / "damaged_left"
+
+    def damaged() -> str | None:
+        """The name of a segment that is on its way, whose copy so far was damaged."""
+        for copy in pulling.glob("seg_*.mcap.part"):
+            try:
+                with copy.open("r+b") as file:
+                    if file.seek(0, os.SEEK_END) < 10_000:
+                        continue
+                    file.seek(5_000)
+                    file.write(b"damage")
+            except FileNotFoundError:  # it was whole meanwhile
+                continue
+            return copy.stem
+        return None
+
+    segment = wait_for("a copy", damaged)
     rig.ask("record", "stop")
     joined = rig.joined()
-    assert "seg_0000.mcap of damaged_left differs from its copy here" in rig.log("here")
+    assert f"{segment} of damaged_left differs from its copy here" in rig.log("here")
     check_joined(rig, joined, rig.data("here") / "damaged", [rig.data("here") / "damaged_left"])
 
 

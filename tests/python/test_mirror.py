@@ -124,7 +124,8 @@ def test_frames_are_here_as_they_are_there(rig: Rig) -> None:
     assert "mirror  moving/infra_none: waits for left: nobody publishes it there" in text
     assert " Hz from left as raw" in text
     # Readers here are no readers there, and the other way round.
-    assert {"moving/color", "moving/depth"} <= set(depthrig.streams("mount", rig.runtime["here"]))
+    listed = {"moving/color", "moving/depth"}
+    wait_for("the streams in the list", lambda: listed <= set(depthrig.streams("mount", rig.runtime["here"])))
     nobody_reads(rig)
 
 

@@ -8,7 +8,7 @@ use core::fmt::Write as _;
 use depthrig_bus::DropReason;
 use depthrig_daemon::status::{
     CameraState, CameraStatus, LinkState, LinkStatus, PreparingStatus, RecordingStatus, RefineState,
-    RefineStatus, ReplayStatus, RigStatus, SignalState, SignalStatus, StreamStatus,
+    RefineStatus, ReplayStatus, RigStatus, Ros2Status, SignalState, SignalStatus, StreamStatus,
 };
 use depthrig_recorder::report::page;
 use std::collections::BTreeMap;
@@ -68,6 +68,7 @@ pub fn status(rig: &RigStatus, style: Style) -> String {
     lines.extend(rig.replay.iter().map(|r| format!("replay  {}", replay(r))));
     lines.extend(rig.link.iter().flat_map(|l| link(l, style)));
     lines.extend(rig.hosts.iter().flat_map(|h| hosts::lines(h, style)));
+    lines.extend(rig.ros2.as_ref().map(|program| ros2(program, style)));
     lines.extend(rig.recording.iter().flat_map(|r| recording(r, style)));
     lines.push(format!(
         "memory  /dev/shm {} free; {} slots a stream, {} in all",
@@ -112,12 +113,27 @@ fn link(link: &LinkStatus, style: Style) -> Vec<String> {
                 cure(),
             ]
         }
+        LinkState::Unkeyed => vec![
+            format!(
+                "link    {host}: {}",
+                style.paint(RED, &format!("{recorder} answers, but has given no key yet"))
+            ),
+            "        depthrig status there says whether it reaches this computer by ssh".to_owned(),
+        ],
         LinkState::Unknown => {
             vec![
                 format!("link    {host}: {}", style.paint(RED, &format!("{recorder} does not answer"))),
                 cure(),
             ]
         }
+    }
+}
+
+/// A line for the program that publishes the rig to ROS 2.
+fn ros2(program: &Ros2Status, style: Style) -> String {
+    match (program.pid, &program.why) {
+        (Some(pid), None) => format!("ros2    depthrig-ros2 runs, process {pid}"),
+        (_, why) => format!("ros2    {}", style.paint(RED, why.as_deref().unwrap_or("it does not run"))),
     }
 }
 

@@ -11,7 +11,7 @@ use super::requests::{
 use super::{SERVER_HEADER, allowed, frames, guard, limits, live};
 use crate::control::{
     CalibratedImage, CameraControls, Control, ControlChanges, ControlList, ControlRequest, EpisodeRequest,
-    GridRequest, GridStreams, RecordRequest, RecordingEpisodes, ReplayControl, SeekRequest, StopRequest,
+    FollowRequest, GridStreams, RecordRequest, RecordingEpisodes, ReplayControl, SeekRequest, StopRequest,
 };
 use crate::doctor::Examined;
 use crate::losses::RecordingLosses;
@@ -63,7 +63,7 @@ pub const ROUTES: [Route; 40] = [
     Route { method: "POST", path: "/v1/record/start", handler: || post(record_start) },
     Route { method: "POST", path: "/v1/record/stop", handler: || post(record_stop) },
     Route { method: "POST", path: "/v1/record/note", handler: || post(record_note) },
-    Route { method: "POST", path: "/v1/sets/grid", handler: || post(sets_grid) },
+    Route { method: "POST", path: "/v1/session/follow", handler: || post(session_follow) },
     Route { method: "POST", path: "/v1/episode", handler: || post(episode) },
     Route { method: "GET", path: "/v1/episodes", handler: || get(episodes) },
     Route { method: "GET", path: "/v1/recordings", handler: || get(recordings_list) },
@@ -288,9 +288,9 @@ async fn record_note(State(rig): State<Rig>, body: Bytes) -> Answer<StatusCode> 
     Ok(StatusCode::NO_CONTENT)
 }
 
-async fn sets_grid(State(rig): State<Rig>, body: Bytes) -> Answer<Json<GridStreams>> {
-    let request: GridRequest = parse(&body)?;
-    call(rig, move |rig| rig.follow_grid(&request)).await.map(Json)
+async fn session_follow(State(rig): State<Rig>, body: Bytes) -> Answer<Json<GridStreams>> {
+    let request: FollowRequest = parse(&body)?;
+    call(rig, move |rig| rig.follow(&request)).await.map(Json)
 }
 
 async fn episode(State(rig): State<Rig>, body: Bytes) -> Answer<Json<Episode>> {

@@ -130,6 +130,7 @@ pub(crate) fn rig_with(port: &str) -> RigStatus {
         signals: Vec::new(),
         link: None,
         hosts: None,
+        ros2: None,
     }
 }
 

@@ -18,19 +18,9 @@ pub(super) fn read(top: &Section<'_, '_>, base: &Path) -> Option<LinkConfig> {
     let host = s.required::<Name>("host", "\"left\"");
     let role = role(&s);
     let insecure = s.or("insecure", false, |_| Ok(()));
-    if let Some(LinkRole::Camera(address) | LinkRole::Recorder(address)) = role
-        && !address.ip().is_loopback()
-        && !insecure
-    {
-        let what = format!(
-            "{address} is reached over a network, and packets of the clock are neither encrypted nor signed: whoever can send \
-             from that address can shift the times; if the network is your own, write insecure = true in [link]"
-        );
-        s.problem(s.at, what);
-    }
     let hosts = hosts(&s, base, host.as_ref().map(|h| &h.value), role);
     s.finish();
-    Some(LinkConfig { host: host?.value, role: role?, hosts: hosts? })
+    Some(LinkConfig { host: host?.value, role: role?, insecure, hosts: hosts? })
 }
 
 /// The other computers; `None` after a problem was noted.

@@ -4,7 +4,7 @@ use super::read::{FromToml, Report, Section};
 use super::value::{above_zero, not_empty, rate, resolve, within};
 use super::{
     BusConfig, ColorCodec, ConfigError, ControlConfig, DepthCodec, MAX_CAMERAS, Phase, Port, RecordingConfig,
-    RigConfig, SetsConfig, SignalConfig, SupervisorConfig, camera, link, refine,
+    RigConfig, SetsConfig, SignalConfig, SupervisorConfig, camera, link, refine, ros2,
 };
 use crate::family::Family;
 use depthrig_bus::{RigName, SignalName};
@@ -56,6 +56,7 @@ pub(super) fn read(
     let cameras = cameras(&top, &base, families);
     let signals = signals(&top);
     let link = link::read(&top, &base);
+    let ros2 = ros2::read(&top, &base);
     check_set_rate(&top, &sets, &cameras);
     top.finish();
     let text = text.to_owned();
@@ -78,6 +79,7 @@ pub(super) fn read(
         cameras,
         signals,
         link,
+        ros2,
         text,
         path,
     })

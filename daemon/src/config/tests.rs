@@ -19,6 +19,7 @@ use std::fmt::Write as _;
 
 mod link;
 mod paper;
+mod ros2;
 
 fn parse(text: &str) -> Result<RigConfig, ConfigError> {
     RigConfig::parse(text, Some(Path::new("/rigs/rig.toml")))

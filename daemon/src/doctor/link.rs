@@ -34,6 +34,18 @@ pub(super) fn check(link: &Result<LinkStatus, String>, findings: &mut Vec<Findin
         }
     };
     let Some(recorder) = &status.recorder else { return };
+    if status.state == LinkState::Unkeyed {
+        let what = format!(
+            "{recorder} answers within {:.0} us; its clock is told to computers that it gave its key to",
+            status.round_trip_us.unwrap_or_default()
+        );
+        let (why, cure) = (
+            "the key comes over ssh from the daemon there to the one here, while both run",
+            "see there with `depthrig status` that it reaches this computer",
+        );
+        findings.push(Finding::new(Severity::Info, "link_answers", what, why, cure));
+        return;
+    }
     let Some(within_us) = status.uncertainty_us else {
         let what = format!("the clock of {recorder} does not answer");
         let cure = format!(

@@ -626,13 +626,23 @@ fn two_kinects_need_more_memory_for_transfers_than_the_kernel_gives() {
 #[test]
 fn the_clock_of_the_session_is_asked_for_before_a_session() {
     use crate::config::{LinkConfig, LinkRole};
-    let link = |role| LinkConfig { host: "left".parse().unwrap(), role, hosts: Vec::new() };
-    let found = |role| {
-        let asked = super::link::ask(&link(role));
+    use depthrig_link::{Key, Trust};
+    let link =
+        |role, insecure| LinkConfig { host: "left".parse().unwrap(), role, insecure, hosts: Vec::new() };
+    let found_of = |role, insecure| {
+        let asked = super::link::ask(&link(role, insecure));
         let report = host_report(FILES, |h| h.link = Some(asked));
         (ids(&report), all_text(&report.findings))
     };
-    let recorder = depthrig_link::Answerer::start("127.0.0.1:0".parse().unwrap()).unwrap();
+    let found = |role| found_of(role, true);
+    let answerer = |trust| depthrig_link::Answerer::start("127.0.0.1:0".parse().unwrap(), trust).unwrap();
+    // Only a daemon gets a key; that it would be answered is known all the same.
+    let keyed = answerer(Trust::Key(Key::random().unwrap()));
+    for insecure in [false, true] {
+        let (ids, text) = found_of(LinkRole::Camera(keyed.address()), insecure);
+        assert_eq!(ids, [("link_answers", Severity::Info)], "{text}");
+    }
+    let recorder = answerer(Trust::Anyone);
     let (ids, text) = found(LinkRole::Camera(recorder.address()));
     // A busy computer may give a loose bound.
     assert!(

@@ -15,8 +15,15 @@ use std::sync::atomic::AtomicBool;
 const PULL_FOR: Duration = Duration::from_millis(500);
 
 impl Hosts {
-    /// Begins and ends parts on a host that was just looked at, and pulls some of them. Returns whether there is more to pull.
-    pub(super) fn visit(&self, host: &Host, client: &Client, status: &RigStatus, stop: &AtomicBool) -> bool {
+    /// Begins (if it `may_begin`) and ends parts on a host that was just looked at, and pulls some of them. Returns whether there is more to pull.
+    pub(super) fn visit(
+        &self,
+        host: &Host,
+        client: &Client,
+        status: &RigStatus,
+        may_begin: bool,
+        stop: &AtomicBool,
+    ) -> bool {
         let name = &host.config.name;
         let recorded = status.recording.as_ref().filter(|r| r.active).map(|r| r.name.as_str());
         if let Some(part) = recorded
@@ -31,7 +38,7 @@ impl Hosts {
         let mut is_busy = false;
         let sessions = lock(&self.sessions).of(name);
         for session in &sessions {
-            if session.goes_on && !session.parts.iter().any(|p| recorded == Some(&p.name)) {
+            if may_begin && session.goes_on && !session.parts.iter().any(|p| recorded == Some(&p.name)) {
                 self.begin_part(host, client, session, recorded);
             }
             for part in session.parts.iter().filter(|p| p.host == *name && !p.is_complete) {

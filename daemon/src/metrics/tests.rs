@@ -127,6 +127,7 @@ fn rig() -> RigStatus {
         signals: Vec::new(),
         link: None,
         hosts: None,
+        ros2: None,
     }
 }
 

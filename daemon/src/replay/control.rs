@@ -222,6 +222,7 @@ impl Control for Inner {
             signals: Vec::new(),
             link: None,
             hosts: None,
+            ros2: None,
             replay: Some(self.replay_status()),
         }
     }

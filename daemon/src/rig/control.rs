@@ -2,10 +2,9 @@
 
 use super::{Inner, controls, lock, report};
 use crate::attached::System;
-use crate::config::{LinkConfig, LinkRole};
 use crate::control::{
     CalibratedImage, CameraControls, Control, ControlChanges, ControlList, ControlRequest, EpisodeRequest,
-    GridRequest, GridStreams, LiveRig, RecordRequest, RecordingEpisodes, Shows,
+    FollowRequest, GridStreams, LiveRig, RecordRequest, RecordingEpisodes, Shows,
 };
 use crate::doctor::{self, Surroundings};
 use crate::losses::RecordingLosses;
@@ -115,8 +114,8 @@ impl Control for Inner {
         Ok(status)
     }
 
-    fn follow_grid(&self, request: &GridRequest) -> Result<GridStreams> {
-        if !matches!(&self.config.link, Some(LinkConfig { role: LinkRole::Camera(_), .. })) {
+    fn follow(&self, request: &FollowRequest) -> Result<GridStreams> {
+        if !self.link.as_ref().is_some_and(|link| link.follow(request.key.as_ref())) {
             let what =
                 "this rig follows the clock of no other computer ([link] with recorder in its rig file)";
             return Err(Error::new(ErrorKind::WrongState, what));

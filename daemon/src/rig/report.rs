@@ -35,6 +35,7 @@ pub fn status(inner: &Inner) -> RigStatus {
         signals,
         link: inner.link.as_ref().map(|link| link.status(now)),
         hosts: inner.hosts.as_ref().map(|hosts| hosts.status()),
+        ros2: inner.ros2.as_ref().map(|ros2| ros2.status()),
         sets: sets(inner),
         recording: recording(inner),
         shared_memory: SharedMemoryStatus {

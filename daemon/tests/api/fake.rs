@@ -7,7 +7,7 @@ use depthrig_daemon::control::{
 use depthrig_daemon::status::{
     CameraState, CameraStatus, ClockStatus, HostRefineStatus, HostState, HostStatus, HostsStatus, JoinState,
     LinkState, LinkStatus, MirrorState, MirrorStatus, PartStatus, PreparingStatus, RecordingStatus,
-    RefineState, RefineStatus, ReplayStatus, RigStatus, SessionStatus, SetAccount, SetStatus,
+    RefineState, RefineStatus, ReplayStatus, RigStatus, Ros2Status, SessionStatus, SetAccount, SetStatus,
     SharedMemoryStatus, SignalState, SignalStatus, StreamStatus,
 };
 use depthrig_daemon::{Error, ErrorKind, Result};
@@ -158,6 +158,7 @@ impl Fake {
             }],
             link: Some(LinkStatus {
                 host: "left".into(),
+                insecure: false,
                 recorder: Some("10.0.0.1:7447".into()),
                 state: LinkState::Live,
                 offset_s: Some(1234.5),
@@ -169,6 +170,7 @@ impl Fake {
                 exchanges: 100,
                 refused: 0,
             }),
+            ros2: Some(Ros2Status { pid: None, why: Some("its process ended with exit code 1".into()) }),
             hosts: Some(HostsStatus {
                 hosts: vec![HostStatus {
                     mirrors: vec![MirrorStatus {

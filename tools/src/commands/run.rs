@@ -51,6 +51,9 @@ pub struct RunArgs {
     /// Serve Foxglove and Lichtblick on this loopback port [default without PORT: 8765]
     #[arg(long, value_name = "PORT", num_args = 0..=1, default_missing_value = "8765", require_equals = true)]
     foxglove: Option<u16>,
+    /// Publish the rig to ROS 2: run depthrig-ros2 as long as the rig (docs/ros2.md)
+    #[arg(long)]
+    ros2: bool,
     /// Print the summary as JSON at the end
     #[arg(long)]
     json: bool,
@@ -64,6 +67,9 @@ pub fn run(args: &RunArgs, context: &Context) -> Result<Exit> {
     }
     if let Some(port) = args.foxglove {
         config.control.foxglove = Port::loopback(port);
+    }
+    if args.ros2 {
+        config.ros2.get_or_insert_default();
     }
     let is_recorded = |camera: &&CameraConfig| camera.refine.as_ref().is_some_and(|r| r.record);
     let refined: Vec<_> = config.cameras.iter().filter(is_recorded).map(|c| c.name.to_string()).collect();

@@ -57,10 +57,11 @@ fn exit(rig: &RigStatus) -> Exit {
         rig.recording.as_ref().is_some_and(|r| r.error.is_some() || r.dropped.values().any(|n| *n > 0));
     let refined = |c: &CameraStatus| c.refine.as_ref().is_none_or(|r| r.state != RefineState::Failed);
     let silent = rig.signals.iter().any(|s| s.required && s.state != SignalState::Live);
-    let adrift = rig.link.as_ref().is_some_and(|l| matches!(l.state, LinkState::Silent | LinkState::Unknown));
+    let adrift = rig.link.as_ref().is_some_and(|l| !matches!(l.state, LinkState::Own | LinkState::Live));
     if lost
         || silent
         || adrift
+        || rig.ros2.as_ref().is_some_and(|ros2| ros2.pid.is_none())
         || rig.hosts.as_ref().is_some_and(HostsStatus::is_ill)
         || !rig.cameras.iter().all(refined)
         || !rig.cameras.iter().all(|c| fine(c.state))

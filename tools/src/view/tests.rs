@@ -70,6 +70,7 @@ fn rig() -> RigStatus {
         signals: Vec::new(),
         link: None,
         hosts: None,
+        ros2: None,
     }
 }
 
@@ -194,6 +195,7 @@ fn color_marks_what_is_wrong_and_clipping_keeps_it_whole() {
 fn the_clock_of_the_session_has_a_line_and_a_cure_if_it_does_not_answer() {
     let known = LinkStatus {
         host: "left".into(),
+        insecure: false,
         recorder: Some("10.0.0.1:7447".into()),
         state: LinkState::Live,
         offset_s: Some(-1_234.567_890_1),
@@ -217,6 +219,8 @@ fn the_clock_of_the_session_has_a_line_and_a_cure_if_it_does_not_answer() {
     assert!(silent.contains("within 21 us, silent for 12 s\n") && silent.contains("firewall"), "{silent}");
     let unknown = shown(LinkStatus { state: LinkState::Unknown, offset_s: None, ..known.clone() });
     assert!(unknown.contains("10.0.0.1:7447 does not answer") && !unknown.contains("within"), "{unknown}");
+    let unkeyed = shown(LinkStatus { state: LinkState::Unkeyed, offset_s: None, ..known.clone() });
+    assert!(unkeyed.contains("10.0.0.1:7447 answers, but has given no key yet\n"), "{unkeyed}");
     let own = shown(LinkStatus { recorder: None, state: LinkState::Own, ..known });
     assert!(own.contains("link    left: the clock of the session is here, 7 questions answered"), "{own}");
 }

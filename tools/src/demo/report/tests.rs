@@ -107,6 +107,7 @@ fn status() -> RigStatus {
         replay: None,
         link: None,
         hosts: None,
+        ros2: None,
         signals: Vec::new(),
     }
 }
