@@ -107,3 +107,42 @@ fn answer(mut socket: Stamped, clock: u64, trust: &Trust, counts: &Counts, stop:
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Key;
+
+    /// Strangers use up what they get in a second; a trusted host asks in the same one.
+    #[test]
+    fn strangers_take_no_answers_from_a_trusted_host() {
+        let trust = Trust::Key(Key::random().unwrap());
+        let answerer = Answerer::start("127.0.0.1:0".parse().unwrap(), trust.clone()).unwrap();
+        let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+        socket.connect(answerer.address()).unwrap();
+        socket.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
+        let mut buffer = [0; 2 * LENGTH];
+        let mut asked = 0;
+        // Those above the limit get nothing, so that only their count says that they arrived.
+        for _ in 0..PER_SECOND + 200 {
+            socket.send(&Question { nonce: [7; 16] }.to_bytes(&Trust::Anyone)).unwrap();
+            asked += 1;
+            if asked <= PER_SECOND {
+                let length = socket.recv(&mut buffer).unwrap();
+                assert_eq!(Refusal::from_bytes(&buffer[..length]), Some(Refusal { nonce: [7; 16] }));
+            }
+        }
+        while answerer.refused() < asked {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        let question = Question { nonce: [8; 16] }.to_bytes(&trust);
+        socket.send(&question).unwrap();
+        let answer = loop {
+            let length = socket.recv(&mut buffer).unwrap();
+            if let Some(answer) = Answer::from_bytes(&buffer[..length]) {
+                break answer;
+            }
+        };
+        assert_eq!((answer.nonce, answerer.answered()), ([8; 16], 1));
+    }
+}

@@ -382,6 +382,7 @@ def test_a_copy_that_was_damaged_is_pulled_again(rig: Rig) -> None:
     [
         ('rig = "mount"', 'rig = "mount2"', "not connected"),
         ('host = "left"', 'host = "third"', 'write host = "left" into [link]'),
+        ('host = "left"', 'host = "left"\ninsecure = true', "only one of both has insecure = true"),
         ('name = "lingbot_3"', 'name = "lingbot_0"', 'camera "lingbot_0" is a name on this computer, too'),
     ],
 )
