@@ -253,3 +253,18 @@ def newer(source: Any, time_ns: int) -> Any:
     """The header of the next frame, if it is of after `time_ns`."""
     with source.next(timeout=WAIT_S) as frame:
         return frame.header if frame.header.capture_time_ns > time_ns else None
+
+
+def test_too_little_shared_memory_is_named_and_harms_no_camera_here(rig: Rig) -> None:
+    small = 'mount -t tmpfs -o size=60m small /dev/shm && exec "$@"'
+    rig.start("here", ["unshare", "-m", "sh", "-c", small, "sh"])
+    rig.start("there")
+    mirror = wait_for_mirror(rig, "moving/color", "waiting")
+    wait_for("the reason", lambda: "has no room for its" in (mirrors(rig)["moving/color"]["why"] or ""))
+    time.sleep(2)
+    assert mirror["frames"] == 0 and mirrors(rig)["moving/color"]["state"] == "waiting"
+    assert rig.log("here").count("stream moving/color is not mirrored") == 1
+    status = rig.status()
+    assert status["shared_memory"]["free_bytes"] < 60 << 20
+    assert [c["state"] for c in status["cameras"]] == ["streaming"] * 2, status["cameras"]
+    assert all(not s["dropped"] for c in status["cameras"] for s in c["streams"])
