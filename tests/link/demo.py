@@ -162,7 +162,7 @@ def main() -> int:
     folder.mkdir(parents=True, exist_ok=True)
     runtime = Path(tempfile.mkdtemp(prefix="d2", dir="/tmp"))
     try:
-        with TwoHosts(folder, "--shift", str(SHIFT_NS), "--rate", options.rate) as hosts:
+        with TwoHosts(folder, SHIFT_NS, options.rate) as hosts:
             return session(hosts, options, folder, runtime)
     finally:
         shutil.rmtree(runtime, ignore_errors=True)
@@ -187,7 +187,7 @@ def cut_wire(hosts: TwoHosts, seconds: float, link: Callable[[], dict]) -> list[
     return [(f"wire cut for {healed - begun:.1f} s", f"seen after {seen_s:.1f} s, back {time.monotonic() - healed:.1f} s after it was whole", "", True)]
 
 
-def mirrored(right: Side, left: Side) -> list[Row]:
+def mirrored(hosts: TwoHosts, right: Side, left: Side) -> list[Row]:
     """How late live frames of the other computer are, beside the same stream there."""
     latency = re.compile(r"latency ([\d.]+) ms")
     tap = ("tap", MIRRORED, "--count", str(MIRROR_FRAMES))
@@ -195,7 +195,9 @@ def mirrored(right: Side, left: Side) -> list[Row]:
         here, there = pool.map(lambda side: [float(ms) for ms in latency.findall(side.ask(*tap))], (right, left))
     added = statistics.median(here) - statistics.median(there)
     said = f"{len(here)} frames of {MIRRORED}, p50 {added:+.1f} ms"
-    return [("added by mirroring", said, "25 ms", added <= 25)]
+    # Of a slow wire nothing is promised.
+    bar = "25 ms" if hosts.rate in ("1gbit", "10gbit") else ""
+    return [("added by mirroring", said, bar, added <= 25)]
 
 
 def session(hosts: TwoHosts, options: argparse.Namespace, folder: Path, runtime: Path) -> int:
@@ -214,7 +216,7 @@ def session(hosts: TwoHosts, options: argparse.Namespace, folder: Path, runtime:
     print(right.ask("record", "start", "--name", "demo", "--scene", "table"), end="", flush=True)
     with Clock(left.runtime / "mount.sock") as seen_clock:
         begun = time.monotonic()
-        mirror = mirrored(right, left)
+        mirror = mirrored(hosts, right, left)
         time.sleep(max(0.0, (options.seconds - options.cut) / 2 - (time.monotonic() - begun)))
         cut = cut_wire(hosts, options.cut, link) if options.cut > 0 else []
         time.sleep((options.seconds - options.cut) / 2)
@@ -243,7 +245,8 @@ def session(hosts: TwoHosts, options: argparse.Namespace, folder: Path, runtime:
         seen_clock.row(),
         *mirror,
         *cut,
-        ("after the end", f"pulled within {pulled_s:.1f} s, joined within {joined_s:.1f} s", "", True),
+        ("pulled after the end", f"{pulled_s:.1f} s", f"{options.seconds:.0f} s (the session's length)", pulled_s <= options.seconds),
+        ("joined after the end", f"{joined_s:.1f} s", "", True),
     ]
     print()
     for name, value, bar, is_met in table:

@@ -55,15 +55,16 @@ def find_sshd() -> str | None:
 
 
 class TwoHosts:
-    """`here` and `there`, joined by a wire; a program of either has its clocks and its network."""
+    """`here` and `there`, joined by a wire of `rate`; a program of either has its clocks, which are `shift_ns` apart, and its network."""
 
-    def __init__(self, folder: Path, *options: str) -> None:
+    def __init__(self, folder: Path, shift_ns: int, rate: str = "1gbit") -> None:
         self.folder = folder
+        self.rate = rate
         self._ends = ExitStack()
         self._environment: dict[str, str] = {}
         pids = {host: folder / f"{host}.pid" for host in ("here", "there")}
         stays = {host: [sys.executable, "-c", STAY, str(path)] for host, path in pids.items()}
-        command = ["unshare", "-Urn", sys.executable, str(TWO_HOSTS), *options, *stays["there"], "--", *stays["here"]]
+        command = ["unshare", "-Urn", sys.executable, str(TWO_HOSTS), "--shift", str(shift_ns), "--rate", rate, *stays["there"], "--", *stays["here"]]
         self._hosts = self._ends.enter_context(subprocess.Popen(command, stdin=subprocess.PIPE))
         self._ends.callback(self._end)
         read = lambda host: pids[host].exists() and pids[host].read_text().strip()  # noqa: E731
@@ -148,7 +149,7 @@ class TwoHosts:
     def heal(self) -> None:
         """The wire is whole again."""
         for host in ("here", "there"):
-            self.run(host, "tc", "qdisc", "replace", "dev", host, "root", "tbf", "rate", "1gbit", "burst", "128k", "limit", "1m")
+            self.run(host, "tc", "qdisc", "replace", "dev", host, "root", "tbf", "rate", self.rate, "burst", "128k", "limit", "1m")
 
     def serve_ssh(self) -> str:
         """An OpenSSH server on the other host, and a client on this one that knows it by the name it returns."""

@@ -95,7 +95,7 @@ class Bench:
 
     def __init__(self, binary: str, folder: Path, rate: str, seconds: float) -> None:
         self.binary, self.folder, self.seconds = binary, folder, seconds
-        self.hosts = TwoHosts(folder, "--shift", str(SHIFT_NS), "--rate", rate)
+        self.hosts = TwoHosts(folder, SHIFT_NS, rate)
         self.runtime = {host: folder / f"r-{host}" for host in ("here", "there")}
         for path in self.runtime.values():
             path.mkdir(mode=0o700)

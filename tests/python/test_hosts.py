@@ -122,15 +122,15 @@ class Rig:
 
 
 @contextmanager
-def two_computers(binary: str, folder: Path, *options: str, **more: Any) -> Iterator[Rig]:  # noqa: F811
-    """Both computers, with `options` of two_hosts.py and `more` of their rig."""
+def two_computers(binary: str, folder: Path, rate: str = "1gbit", **more: Any) -> Iterator[Rig]:  # noqa: F811
+    """Both computers, joined by a wire of `rate`, with `more` of their rig."""
     if why := why_not():
         pytest.skip(why)
     runtime = Path(subprocess.run(["mktemp", "-d", "/tmp/hXXXX"], capture_output=True, text=True, check=True).stdout.strip())
     # The server's user is another one where the tests run as root.
     for path in (folder, runtime):
         os.chmod(path, 0o700)
-    with TwoHosts(folder, "--shift", str(SHIFT_NS), *options) as hosts:
+    with TwoHosts(folder, SHIFT_NS, rate) as hosts:
         yield Rig(hosts, binary, folder, runtime, **more)
 
 

@@ -43,7 +43,7 @@ rate_hz = 30.0
 
 @pytest.fixture
 def rig(binary: str, tmp_path: Path) -> Iterator[Rig]:  # noqa: F811
-    with two_computers(binary, tmp_path, "--rate", "10gbit", mirror=[*STREAMS, "moving/infra_none"], more=MOVING) as rig:
+    with two_computers(binary, tmp_path, "10gbit", mirror=[*STREAMS, "moving/infra_none"], more=MOVING) as rig:
         yield rig
 
 
@@ -186,7 +186,7 @@ def test_a_cut_wire_and_a_killed_daemon_are_gaps_that_are_counted(rig: Rig) -> N
 
 
 def test_frames_come_small_where_the_way_is_slow(binary: str, tmp_path: Path) -> None:  # noqa: F811
-    with two_computers(binary, tmp_path, "--rate", "100mbit", mirror=STREAMS, more=MOVING) as rig:
+    with two_computers(binary, tmp_path, "100mbit", mirror=STREAMS, more=MOVING) as rig:
         rig.start("here")
         rig.start("there")
         with read(rig):
@@ -212,7 +212,7 @@ def check_small(rig: Rig) -> None:
 def test_depth_of_the_other_computer_is_refined_here_as_it_would_be_there(binary: str, tmp_path: Path) -> None:  # noqa: F811
     refine = '[link.hosts.refine]\nengine = "fill"\n'
     more = MOVING + '[camera.refine]\nengine = "fill"\n'
-    with two_computers(binary, tmp_path, "--rate", "10gbit", mirror=STREAMS, refine=refine, more=more) as rig:
+    with two_computers(binary, tmp_path, "10gbit", mirror=STREAMS, refine=refine, more=more) as rig:
         rig.start("here")
         assert rig.host()["refined"] == [{"camera": "moving", "refine": None}]
         assert "refined   moving: waits for its color and depth" in rig.ask("status", codes=(3,))
