@@ -5,8 +5,10 @@ The two computers have clocks that are apart by a known time, so that each frame
 
 from __future__ import annotations
 
+import json
 import re
 import time
+import tomllib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -268,3 +270,46 @@ def test_too_little_shared_memory_is_named_and_harms_no_camera_here(rig: Rig) ->
     assert status["shared_memory"]["free_bytes"] < 60 << 20
     assert [c["state"] for c in status["cameras"]] == ["streaming"] * 2, status["cameras"]
     assert all(not s["dropped"] for c in status["cameras"] for s in c["streams"])
+
+
+def board_camera(name: str, x_m: float) -> str:
+    """A camera before the board, which rests at one place as long as this test."""
+    return f"""
+[[camera]]
+name = "{name}"
+backend = "synthetic"
+model = "d415"
+serial = "{name}-1"
+pose = {{ translation_m = [{x_m}, 0.0, 0.0] }}
+stream = [{{ name = "color", width = 640, height = 480, rate_hz = 15.0 }}]
+board = {{ file = "board.toml", motion = "wall", hold_s = 600.0 }}
+"""
+
+
+def test_a_view_of_the_board_has_cameras_of_both_computers(binary: str, tmp_path: Path) -> None:  # noqa: F811
+    with two_computers(binary, tmp_path, mirror=["left/color"], more=board_camera("left", 0.05)) as rig:
+        here = rig.rig_file("here")
+        here.write_text(here.read_text() + board_camera("right", -0.05))
+        rig.ask("calibrate", "board", "--paper", "a3", "--name", str(tmp_path / "board"))
+        rig.start("here")
+        rig.start("there")
+        wait_for_mirror(rig, "left/color", "unread")
+        views = tmp_path / "views"
+        board = tmp_path / "board.toml"
+        said = rig.ask("calibrate", "capture", "mount", "--board", str(board), "-o", str(views), "--views", "1", "--json")
+        progress = json.loads(said.splitlines()[-1])["progress"]
+        assert progress["pairs"] == [{"a": "left", "b": "right", "shared": 1, "missing": 2}]
+        # Side by side before a board that faces them, they see it shifted by their distance, which the squares measure.
+        sheet = tomllib.loads(board.read_text())
+        corners = {c["name"]: np.array(c["at"]) * (640, 480) for c in progress["cameras"] if c["at"]}
+        for name in corners:
+            with depthrig.Stream(f"{name}/color", "mount", rig.runtime["here"], timeout=WAIT_S) as stream, stream.next(timeout=WAIT_S) as frame:
+                k = frame.header.intrinsics
+            corners[name] = (corners[name] - (k.cx, k.cy)) / (k.fx, k.fy)
+        assert {name: len(at) for name, at in corners.items()} == {"left": 70, "right": 70}
+        shift = corners["right"] - corners["left"]
+        square = np.diff(corners["left"].reshape(7, 10, 2)[..., 0]).mean()
+        assert np.abs(shift[:, 1]).max() < 1 / 600, "on the same rows"
+        assert abs(shift[:, 0].mean() / square * sheet["square_mm"] - 100) < 1
+        streams = {s["stream"] for s in json.loads(rig.ask("info", "--json", str(views)))["streams"]}
+        assert {"left/color", "right/color"} <= streams

@@ -7,7 +7,7 @@ use core::time::Duration;
 use depthrig_bus::{Bus, Frame, FrameHeader, HostTime, RigName, RuntimeDir, StreamId, Subscriber};
 use depthrig_daemon::client::Client;
 use depthrig_daemon::config::RigConfig;
-use depthrig_daemon::status::CameraState;
+use depthrig_daemon::status::{CameraState, CameraStatus, MirrorState, MirrorStatus};
 use std::path::{Path, PathBuf};
 
 /// A stream without a new frame for this long is not waited for.
@@ -162,13 +162,14 @@ impl LiveStream {
     }
 }
 
-/// The streams of a rig that are images, with what its daemon says of them. Cameras that are being opened are waited for; `None` when the
-/// end is asked for meanwhile.
+/// The streams of a rig that are images, with what its daemon says of them, and those of its other computers that are mirrored here. Cameras
+/// that are being opened are waited for; `None` when the end is asked for meanwhile.
 ///
 /// # Errors
-/// When the daemon does not answer.
+/// When the daemon does not answer, or that of a computer whose streams are mirrored.
 pub fn streams(rig: &RigName, stop: &Stop, context: &Context) -> Result<Option<Vec<StreamFacts>>> {
-    let client = Client::connect(&context.runtime()?, Some(rig))?;
+    let runtime = context.runtime()?;
+    let client = Client::connect(&runtime, Some(rig))?;
     let began = HostTime::now();
     let status = loop {
         let status = client.status()?;
@@ -180,9 +181,24 @@ pub fn streams(rig: &RigName, stop: &Stop, context: &Context) -> Result<Option<V
             return Ok(None);
         }
     };
+    let mut all = facts(&status.cameras, |_| true)?;
+    for host in status.hosts.iter().flat_map(|hosts| &hosts.hosts) {
+        let is_here =
+            |mirror: &&MirrorStatus| matches!(mirror.state, MirrorState::Live | MirrorState::Unread);
+        let here: Vec<&str> =
+            host.mirrors.iter().filter(is_here).map(|mirror| mirror.stream.as_str()).collect();
+        if !here.is_empty() {
+            let there = Client::of_host(&runtime, rig, &host.host.parse()?)?.status()?;
+            all.extend(facts(&there.cameras, |id| here.contains(&id))?);
+        }
+    }
+    Ok(Some(all))
+}
+
+fn facts(cameras: &[CameraStatus], is_wanted: impl Fn(&str) -> bool) -> Result<Vec<StreamFacts>> {
     let mut all = Vec::new();
-    for camera in &status.cameras {
-        for stream in camera.streams.iter().filter(|s| s.samples_hz.is_none()) {
+    for camera in cameras {
+        for stream in camera.streams.iter().filter(|s| s.samples_hz.is_none() && is_wanted(&s.id)) {
             all.push(StreamFacts {
                 id: stream.id.parse()?,
                 rate_hz: stream.nominal_hz,
@@ -192,7 +208,7 @@ pub fn streams(rig: &RigName, stop: &Stop, context: &Context) -> Result<Option<V
             });
         }
     }
-    Ok(Some(all))
+    Ok(all)
 }
 
 /// Facts about a stream, from the daemon.
