@@ -94,7 +94,7 @@ pub struct LinkConfig {
 }
 
 /// The program that publishes the rig to ROS 2, which the daemon starts.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Ros2Config {
     /// The program and its arguments; empty: `depthrig-ros2`, of the Python environment that this program is in, or found by `PATH`.
     pub command: Vec<String>,
@@ -334,6 +334,12 @@ impl CameraConfig {
         profiles: &[StreamProfile],
     ) -> crate::Result<Vec<(StreamProfile, bool)>> {
         crate::stage::profiles(self.refine.as_ref(), self.record.as_deref(), profiles)
+    }
+}
+
+impl Default for Ros2Config {
+    fn default() -> Self {
+        Self { command: Vec::new(), directory: PathBuf::from(".") }
     }
 }
 

@@ -34,10 +34,12 @@ rate_hz = 10
 
 
 @contextmanager
-def rig(binary: str, runtime: Path, folder: Path, program: list[str]) -> Iterator[None]:
+def rig(binary: str, runtime: Path, folder: Path, program: list[str] | None) -> Iterator[None]:
+    """A rig that runs `program`; with None by `--ros2`, without a table in its file."""
     path = folder / "rig.toml"
-    path.write_text(f'rig = "bench"\n[control]\ntcp = "off"\n[ros2]\ncommand = {json.dumps(program)}\n{CAMERA}')
-    with running(binary, runtime, folder / "log", "run", str(path), "-q"):
+    table = "" if program is None else f"[ros2]\ncommand = {json.dumps(program)}\n"
+    path.write_text(f'rig = "bench"\n[control]\ntcp = "off"\n{table}{CAMERA}')
+    with running(binary, runtime, folder / "log", "run", str(path), "-q", *([] if program else ["--ros2"])):
         until(lambda: (runtime / "bench.sock").exists(), "the daemon")
         yield
 
@@ -75,3 +77,17 @@ def test_a_program_that_does_not_exist_is_named_with_its_cure(binary: str, runti
         until(lambda: status(binary, runtime)["pid"], "the program that was installed meanwhile")
         assert "depthrig-ros2 runs" in command(binary, runtime, "--rig", "bench", "status")
     assert (tmp_path / "log").read_text().count("pip install") == 1
+
+
+def test_an_option_runs_the_program_that_path_has(
+    binary: str, runtime: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said = tmp_path / "said"
+    program = tmp_path / "bin" / "depthrig-ros2"
+    program.parent.mkdir()
+    program.write_text(f"#!{sys.executable}\nimport sys, time\nopen({str(said)!r}, 'w').write(' '.join(sys.argv[1:]) + '.')\ntime.sleep(600)\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{program.parent}:{os.environ['PATH']}")
+    with rig(binary, runtime, tmp_path, None):
+        until(lambda: said.exists() and said.read_text() == "--rig bench.", "the program")
+        assert status(binary, runtime)["pid"]
