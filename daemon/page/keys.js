@@ -48,7 +48,9 @@ const TEXT_INPUTS = ["text", "search", "number", "email", "url", "password", "te
  * @returns {KeyTarget}
  */
 export function keyTarget(target) {
-  const element = target instanceof HTMLElement ? target : null;
+  // A dialog that was just closed keeps the focus until the next image of the page is drawn.
+  const isLeft = target instanceof HTMLElement && target.closest("dialog:not([open])") !== null;
+  const element = target instanceof HTMLElement && !isLeft ? target : null;
   const type = element instanceof HTMLInputElement ? element.type : "";
   const isSelect = element instanceof HTMLSelectElement;
   const isButton = element instanceof HTMLButtonElement;
