@@ -3,7 +3,6 @@
 use crate::config::Ros2Config;
 use crate::status::Ros2Status;
 use core::time::Duration;
-use depthrig_bus::external::RIG_VARIABLE;
 use depthrig_bus::runtime::RUNTIME_DIR_VARIABLE;
 use depthrig_bus::sync::lock;
 use depthrig_bus::{RigName, RuntimeDir};
@@ -41,10 +40,7 @@ impl Ros2 {
             owner: Owner::Rig("ros2"),
             command,
             directory: config.directory.clone(),
-            environment: vec![
-                (RUNTIME_DIR_VARIABLE, runtime.path().into()),
-                (RIG_VARIABLE, rig.as_str().into()),
-            ],
+            environment: vec![(RUNTIME_DIR_VARIABLE, runtime.path().into())],
         };
         Self {
             program,
@@ -52,7 +48,7 @@ impl Ros2 {
         }
     }
 
-    /// Whether it runs.
+    /// Its process, or the reason why it does not run.
     pub fn status(&self) -> Ros2Status {
         lock(&self.status).clone()
     }

@@ -85,7 +85,7 @@ impl Trust {
         }
     }
 
-    /// Whether a message with this signature is believed. It takes as long for wrong signatures as for right ones.
+    /// Checks the signature of a message, in a time that does not depend on the bytes of either.
     pub(crate) fn believes(&self, message: &[u8], signature: &[u8]) -> bool {
         match self {
             Self::Anyone => true,

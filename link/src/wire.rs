@@ -75,7 +75,7 @@ impl Answer {
     }
 }
 
-/// Whether a packet is from someone who is trusted.
+/// Checks the signature of a packet.
 pub fn is_trusted(bytes: &[u8], trust: &Trust) -> bool {
     bytes.split_at_checked(SIGNED).is_some_and(|(message, signature)| trust.believes(message, signature))
 }

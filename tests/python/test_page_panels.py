@@ -488,6 +488,24 @@ def test_after_a_click_on_a_panel_or_the_help_the_key_still_records(wall: Wall) 
     wall.wait_for("() => document.activeElement === document.querySelector('button[data-panel=sync]')")
 
 
+# A key in the moment in which Help closes: the button in it has the focus until the next image of the page is drawn.
+KEY_AT_CLOSE = """() => {
+    const help = document.querySelector("#help");
+    help.showModal();
+    help.close();
+    const focused = document.activeElement;
+    focused.dispatchEvent(new KeyboardEvent("keydown", { key: " ", bubbles: true, cancelable: true }));
+    return focused.closest("dialog") !== null;
+}"""
+
+
+def test_a_key_in_the_moment_in_which_help_closes_records(wall: Wall) -> None:
+    until(lambda: wall.page.is_enabled("#start-stop"), wall.record_text)
+    assert wall.page.evaluate(KEY_AT_CLOSE)
+    until(lambda: wall.state("#record-state") == "recording", wall.record_text)
+    stop(wall)
+
+
 def test_every_stream_is_in_the_table_of_the_synchronisation(wall: Wall) -> None:
     panel = open_panel(wall, "y", "Synchronisation")
     heads = panel.locator("tbody th")

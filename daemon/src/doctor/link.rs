@@ -36,7 +36,7 @@ pub(super) fn check(link: &Result<LinkStatus, String>, findings: &mut Vec<Findin
     let Some(recorder) = &status.recorder else { return };
     if status.state == LinkState::Unkeyed {
         let what = format!(
-            "{recorder} answers within {:.0} us; its clock is told to computers that it gave its key to",
+            "{recorder} answers within {:.0} us; a computer gets its clock once it has its key",
             status.round_trip_us.unwrap_or_default()
         );
         let (why, cure) = (
