@@ -28,6 +28,8 @@ CAMERA, TARGET = np.array([0.02, -0.60, 0.47]), np.array([-0.01, 0.09, 0.07])
 """Where the mount stands while the arm moves, and the point that it looks at."""
 STEP_NS = 1e9 / 6
 """Cameras show the arm where it was at the last multiple of this on the host's clock."""
+LATE_NS = 3e6 + 8e6 / 2
+"""The least latency of a simulated d435, and half its exposure: a constant that no clock sees, and that capture times are late by."""
 
 
 def hand_and_fingers(joints: np.ndarray, opening: float) -> tuple[np.ndarray, np.ndarray]:
@@ -71,6 +73,17 @@ def offsets(dataset: Path) -> int:
     raise AssertionError("the dataset has no sets")
 
 
+def uncertainties(dataset: Path, topic: str) -> dict[int, int]:
+    """By how much a frame's capture time may be off, nanoseconds, as the dataset states it; at the time of its image."""
+    found = {}
+    for segment in sorted(dataset.glob("seg_*.mcap")):
+        with segment.open("rb") as file:
+            reader = make_reader(file, decoder_factories=[DecoderFactory()])
+            for _, _, message, decoded in reader.iter_decoded_messages(topics=[topic]):
+                found[message.publish_time] = decoded.capture_uncertainty_ns
+    return found
+
+
 def middle_of(alike: np.ndarray, column: int) -> float:
     """The middle of the run of alike columns around one."""
     assert alike[column]
@@ -102,11 +115,14 @@ def test_the_arm_in_the_images_is_where_its_joints_say(dataset: Path) -> None:
     gripper_at, opening = samples(dataset, "/cell/arm/gripper/values", "fields")
     fingers = visible = hands = 0
     for topic, name in [("/cell/top/depth/image_raw", "top/depth"), ("/cell/top/color/image_compressed", "top/color")]:
+        uncertainty = uncertainties(dataset, f"/cell/{name}/frame_info")
         for capture, pixels in images(dataset, topic).items():
-            since = (capture - offset) % STEP_NS
-            shown = capture - since
-            # Just beside a step the one before or after it may be shown.
-            if not (at[0] <= shown <= at[-1] and 3e6 < since < STEP_NS - 3e6):
+            taken = capture - LATE_NS
+            since = (taken - offset) % STEP_NS
+            shown = taken - since
+            # So near to a step the one before or after it may be shown. Frames this early may all have come a little later than the least.
+            near = uncertainty[capture] + 0.5e6
+            if not (at[0] <= shown <= at[-1] and near < since < STEP_NS - near):
                 continue
             now = np.array([np.interp(shown - at[0], at - at[0], column) for column in joints.T])
             hand, tips = hand_and_fingers(now, float(np.interp(shown - at[0], gripper_at - at[0], opening[:, 0])))

@@ -171,9 +171,11 @@ def test_images_are_those_of_the_bus(node: Bridge, router: Router, runtime: Path
             assert list(one.k) == [k.fx, 0, k.cx, 0, k.fy, k.cy, 0, 0, 1]
             assert list(one.p) == [k.fx, 0, k.cx, 0, 0, k.fy, k.cy, 0, 0, 0, 1, 0]
             assert (list(one.d), list(one.r)) == (list(k.coeffs[:5]), [1, 0, 0, 0, 1, 0, 0, 0, 1])
-            # Numbers from 1 on, the time of sending, and one identity.
-            numbers = [int.from_bytes(a[:8], "little") for a in raw.attachments]
-            assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+            # Numbers of what was sent, the time of sending, and one identity. On a busy computer an image may be lost on its way to the
+            # subscriber, as images are sent at best effort: its number is missed then, and so is its frame.
+            numbers = [int.from_bytes(a[:8], "little") for a in raw.attachments[: len(messages)]]
+            frames = [bus.at(stamp_ns(message)).header.sequence for message in messages[1:]]
+            assert all(1 <= sent <= taken for sent, taken in zip(np.diff(numbers[1:]), np.diff(frames), strict=True)), (numbers, frames)
             token = next(t for t in router.tokens if f"%{name}%image_raw/" in t and "/depthrig_cell/" in t)
             assert {a[16:] for a in raw.attachments} == {b"\x10" + _names.identity(token)}
             sent_ns = int.from_bytes(raw.attachments[-1][8:16], "little")
