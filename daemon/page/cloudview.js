@@ -8,6 +8,7 @@ import { CloudLabels } from "./cloudlabels.js";
 import { floorLines, frustumLines, poseOf, upOf } from "./cloudscene.js";
 import { CloudSource, TINTS, sourcesOf } from "./cloudsource.js";
 import { announce, byId, setText } from "./dom.js";
+import { shownCameras } from "./livestatus.js";
 import { dot, multiply } from "./matrix.js";
 import { home, projectionMatrix, quantile, viewMatrix } from "./orbit.js";
 import { SMALL_WIDTH, Thinning, cloudWidth } from "./thinning.js";
@@ -194,7 +195,7 @@ export class CloudView {
   /** @param {Status} status */
   update(status) {
     this.#status = status;
-    const streams = sourcesOf(status.cameras, isDepthFormat);
+    const streams = sourcesOf(shownCameras(status), isDepthFormat);
     const built = JSON.stringify(streams);
     if (built !== this.#built) {
       this.#built = built;
@@ -288,7 +289,8 @@ export class CloudView {
    * @param {CloudSource} source
    */
   #isLost(source) {
-    const camera = this.#status?.cameras.find(({ name }) => name === source.camera);
+    const cameras = this.#status === null ? [] : shownCameras(this.#status);
+    const camera = cameras.find(({ name }) => name === source.camera);
     const stream = camera?.streams.find(({ id }) => id === source.id);
     if (camera?.state !== "streaming" || stream === undefined) {
       return true;

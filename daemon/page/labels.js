@@ -100,7 +100,9 @@ export class TileLabels {
     }
     const drawnAge = this.#ages.get(tile.id);
     const since = now - tile.drawnAt;
-    const ageText = drawnAge === undefined ? "no image" : age(drawnAge + (since > AGEING_MS ? since : 0));
+    // The tiles of a wall that was built anew have none yet.
+    const hasImage = drawnAge !== undefined && tile.drawnAt !== -Infinity;
+    const ageText = !hasImage ? "no image" : age(drawnAge + (since > AGEING_MS ? since : 0));
     return `${rate} · ${ageText} · ${lost}`;
   }
 }

@@ -1,8 +1,19 @@
-/** The status of the live rig while the connection shows a dataset. */
+/** The cameras in a status, and the status of the live rig while the connection shows a dataset. */
 
 import { get } from "./api.js";
 
+/** @typedef {import("./types.js").CameraStatus} CameraStatus */
 /** @typedef {import("./types.js").Status} Status */
+
+/**
+ * Cameras whose images can be seen here: those of this computer, and those of others whose streams come here.
+ *
+ * @param {Status} status
+ * @returns {CameraStatus[]}
+ */
+export function shownCameras(status) {
+  return [...status.cameras, ...(status.hosts?.hosts ?? []).flatMap(({ mirrored }) => mirrored ?? [])];
+}
 
 const EVERY_MS = 700;
 

@@ -10,7 +10,7 @@ import { EpisodeBar } from "./episodebar.js";
 import { Hover } from "./hover.js";
 import { actionOf, keyTarget } from "./keys.js";
 import { TileLabels } from "./labels.js";
-import { LiveStatus } from "./livestatus.js";
+import { LiveStatus, shownCameras } from "./livestatus.js";
 import { mixings } from "./mixture.js";
 import { Panels } from "./panels.js";
 import { PROTOCOL } from "./protocol.js";
@@ -200,9 +200,9 @@ function welcome(hello) {
 function showStatus(next) {
   soundForCameras(next);
   status = next;
-  wall.build(next.cameras);
+  wall.build(shownCameras(next));
   cloud.update(next);
-  for (const camera of next.cameras) {
+  for (const camera of shownCameras(next)) {
     for (const stream of camera.streams) {
       const tile = wall.tiles.get(stream.id);
       if (tile !== undefined) {
@@ -236,8 +236,9 @@ function preparingText(next) {
 
 /** @param {Status} next */
 function soundForCameras(next) {
-  for (const camera of next.cameras) {
-    const before = status?.cameras.find(({ name }) => name === camera.name);
+  const shown = status === null ? [] : shownCameras(status);
+  for (const camera of shownCameras(next)) {
+    const before = shown.find(({ name }) => name === camera.name);
     const hasFailed = camera.state === "failed" || camera.state === "reconnecting";
     if (before?.state === "streaming" && hasFailed) {
       play("error");
@@ -261,7 +262,7 @@ function showTiles() {
   range.follow(cloud.isOpen ? cloud.sources : wall.tiles.values(), now);
   cloud.tick(now);
   const facts = {
-    cameras: status.cameras,
+    cameras: shownCameras(status),
     isLive: connection.isLive,
     isReplay: replayBar.isShown,
     isPaused: replayBar.isShown && replayBar.isWaiting,

@@ -137,6 +137,7 @@
  * @property {number} cameras
  * @property {number} streaming
  * @property {boolean} has_clock
+ * @property {CameraStatus[]} [mirrored] with the streams that come here
  *
  * @typedef {Object} HostsStatus
  * @property {HostStatus[]} hosts

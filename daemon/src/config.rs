@@ -322,7 +322,7 @@ impl CameraConfig {
     /// Whether `stream` is computed here from others of the camera, and does not come from the device.
     pub(crate) fn is_computed_here(&self, stream: &StreamName) -> bool {
         let stereo = self.stereo.as_ref().is_some_and(|s| s.streams().iter().any(|n| n == stream.as_str()));
-        stereo || crate::stage::is_derived(stream)
+        stereo || crate::stream::is_derived(stream)
     }
 
     /// The streams that are computed from `profiles`, and whether each is recorded.

@@ -7,6 +7,7 @@
 //! ```text
 //! session  the recordings with parts elsewhere, and a file beside each that says so
 //! visit    what one look at a host's status leads to: begin, stop, pull
+//! mirrored its cameras, as they are seen here
 //! pull     segments by ranges of bytes, resumed where they ended, compared at the end
 //! ```
 //!
@@ -14,6 +15,7 @@
 //! should be: a host that was away while a recording began gets a part later, and one that missed its end is stopped
 //! later, whoever was killed or cut off meanwhile.
 
+mod mirrored;
 mod pull;
 mod refine;
 mod session;
@@ -27,7 +29,9 @@ use crate::control::{FollowRequest, RecordRequest};
 use crate::mirror::Mirror;
 use crate::recording::reserve_bytes;
 use crate::sets::Grid;
-use crate::status::{CameraState, HostState, HostStatus, HostsStatus, JoinState, RecordingStatus, RigStatus};
+use crate::status::{
+    CameraState, CameraStatus, HostState, HostStatus, HostsStatus, JoinState, RecordingStatus, RigStatus,
+};
 use crate::wake::Wake;
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
@@ -95,7 +99,7 @@ struct Host {
     config: HostConfig,
     seen: Mutex<HostStatus>,
     /// Cameras there, at the last look.
-    cameras: Mutex<Vec<String>>,
+    cameras: Mutex<Vec<CameraStatus>>,
     /// Its streams that come here.
     mirrors: Vec<Mirror>,
     /// Its cameras whose depth is refined here.
@@ -104,9 +108,15 @@ struct Host {
 
 impl Host {
     fn status(&self) -> HostStatus {
-        let mirrors = self.mirrors.iter().map(Mirror::status).collect();
+        let seen = lock(&self.seen).clone();
+        let mirrors: Vec<_> = self.mirrors.iter().map(Mirror::status).collect();
         let refined = self.refined.iter().map(HostRefine::status).collect();
-        HostStatus { mirrors, refined, ..lock(&self.seen).clone() }
+        let made = |camera: &str| {
+            let own = self.refined.iter().filter(|refine| refine.is_of(camera));
+            own.flat_map(HostRefine::streams).collect()
+        };
+        let mirrored = mirrored::cameras(&seen, &lock(&self.cameras), &mirrors, &made);
+        HostStatus { mirrors, refined, mirrored, ..seen }
     }
 
     /// Gives its cameras to the stage that refines depth.
@@ -147,14 +157,8 @@ impl Hosts {
         }
         let seen = |host: &HostConfig| HostStatus {
             host: host.name.to_string(),
-            state: HostState::Absent,
             why: Some("it was not asked yet".to_owned()),
-            cameras: 0,
-            streaming: 0,
-            has_clock: false,
-            recording: None,
-            mirrors: Vec::new(),
-            refined: Vec::new(),
+            ..HostStatus::default()
         };
         let mirrors = |h: &HostConfig| {
             let socket = runtime.host_socket_path(&config.rig, &h.name);
@@ -322,15 +326,14 @@ impl Hosts {
         let mut seen = HostStatus { host: name.to_string(), ..lock(&host.seen).clone() };
         match looked {
             Ok(status) => {
-                let cameras: Vec<_> = status.cameras.iter().map(|c| c.name.clone()).collect();
-                let refusal = self.refusal(host, status, &cameras);
+                let refusal = self.refusal(host, status);
                 seen.state = if refusal.is_some() { HostState::Refused } else { HostState::Connected };
                 seen.why = refusal.or_else(|| lock(&self.sessions).excuse(name));
                 seen.cameras = status.cameras.len();
                 seen.streaming = status.cameras.iter().filter(|c| c.state == CameraState::Streaming).count();
                 seen.has_clock = status.link.as_ref().is_some_and(|link| link.offset_s.is_some());
                 seen.recording = status.recording.as_ref().filter(|r| r.active).map(|r| r.name.clone());
-                *lock(&host.cameras) = cameras;
+                lock(&host.cameras).clone_from(&status.cameras);
             }
             Err(e) => {
                 seen.state = HostState::Absent;
@@ -357,7 +360,7 @@ impl Hosts {
     }
 
     /// The reason to refuse a daemon that answers as this host; `None` without one.
-    fn refusal(&self, host: &Host, status: &RigStatus, cameras: &[String]) -> Option<String> {
+    fn refusal(&self, host: &Host, status: &RigStatus) -> Option<String> {
         let name = &host.config.name;
         if status.rig != self.rig.as_str() {
             return Some(format!(
@@ -387,12 +390,17 @@ impl Hosts {
                     .to_owned(),
             );
         }
-        let twice = |names: &[String]| cameras.iter().find(|c| names.contains(c)).cloned();
+        let twice = |is_taken: &dyn Fn(&String) -> bool| {
+            status.cameras.iter().map(|camera| &camera.name).find(|name| is_taken(name)).cloned()
+        };
         let others = self.others.iter().filter(|other| other.config.name != *name);
-        let shared = twice(&self.cameras).map(|c| (c, "this computer".to_owned())).or_else(|| {
-            others
-                .into_iter()
-                .find_map(|o| Some((twice(&lock(&o.cameras))?, format!("host {}", o.config.name))))
+        let here = twice(&|name| self.cameras.contains(name)).map(|c| (c, "this computer".to_owned()));
+        let shared = here.or_else(|| {
+            others.into_iter().find_map(|o| {
+                let there = lock(&o.cameras);
+                let name = twice(&|name| there.iter().any(|camera| camera.name == *name))?;
+                Some((name, format!("host {}", o.config.name)))
+            })
         });
         let (camera, where_) = shared?;
         Some(format!("camera \"{camera}\" is a name on {where_}, too; give one of them another name"))

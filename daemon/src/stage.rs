@@ -264,8 +264,3 @@ pub fn profiles(
     }
     Ok(all)
 }
-
-/// Whether a stream of this name is computed from others.
-pub fn is_derived(stream: &StreamName) -> bool {
-    [REFINED, ALIGNED].contains(&stream.as_str())
-}

@@ -188,11 +188,12 @@ pub struct ReplayStatus {
 }
 
 /// The state of a camera's supervisor.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[non_exhaustive]
 pub enum CameraState {
     /// Being opened for the first time.
+    #[default]
     Opening,
     /// Frames come.
     Streaming,
@@ -235,7 +236,7 @@ impl CameraState {
 }
 
 /// One camera.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct CameraStatus {
     /// Its name in the rig.
     pub name: String,
@@ -361,7 +362,7 @@ pub struct RefineStatus {
 }
 
 /// One stream. `captured = delivered + Σ dropped`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct StreamStatus {
     /// `camera/stream`.
     pub id: String,

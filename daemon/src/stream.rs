@@ -3,11 +3,13 @@
 //! The books are double-entry: `captured` is the number of frames that the device announced, `delivered` and `dropped`
 //! are their fates, and [`Books::close`] balances them when a hung thread is given up with a frame in its hands.
 
+use crate::status::{ClockStatus, SetAccount, StreamStatus};
 use depthrig_bus::sync::lock;
 use depthrig_bus::{
-    DropCounts, DropReason, FrameFlags, FrameHeader, HostTime, MetadataLevel, PixelFormat, Publisher,
-    StreamId, Subscriber,
+    ClockDomain, DropCounts, DropReason, FrameFlags, FrameHeader, HostTime, MetadataLevel, PixelFormat,
+    Publisher, StreamId, StreamName, Subscriber,
 };
+use depthrig_cdm::stage::{ALIGNED, REFINED};
 use depthrig_driver::StreamProfile;
 use depthrig_driver::clock::ClockQuality;
 use std::collections::VecDeque;
@@ -108,6 +110,52 @@ impl Stream {
     pub fn books(&self) -> MutexGuard<'_, Books> {
         lock(&self.books)
     }
+
+    /// The stream in numbers.
+    pub fn status(&self, in_sets: SetAccount, now: HostTime) -> StreamStatus {
+        let p = &self.profile;
+        let books = self.books();
+        let clock = books.clock.as_ref();
+        let us = |ns: i64| ns as f64 / 1e3;
+        StreamStatus {
+            id: self.id.to_string(),
+            derived: is_derived(&self.id.stream),
+            format: p.format.name().to_owned(),
+            width: p.width,
+            height: p.height,
+            nominal_hz: p.rate_hz,
+            rate_hz: books.rate_hz(now),
+            samples_hz: p.format.is_motion().then(|| books.samples_hz(now)),
+            captured: books.captured,
+            delivered: books.delivered,
+            dropped: books.dropped.nonzero().map(|(r, n)| (r.name().to_owned(), n)).collect(),
+            last_frame_age_ms: books.last_frame.map(|t| now.since_ns(t) as f64 / 1e6),
+            latency_p50_ms: books.latency_ms(0.5),
+            latency_p99_ms: books.latency_ms(0.99),
+            clock: ClockStatus {
+                domain: match p.clock.domain {
+                    ClockDomain::Device => "device",
+                    ClockDomain::Kernel => "kernel",
+                    _ => "arrival",
+                }
+                .to_owned(),
+                metadata: books.metadata.unwrap_or(p.metadata).name().to_owned(),
+                metadata_lost: books.metadata_lost,
+                epoch: books.epoch,
+                rate_ppm: clock.map_or(0.0, |c| c.rate_ppm),
+                uncertainty_us: books.uncertainty_ns as f64 / 1e3,
+                residual_p50_us: clock.map_or(0.0, |c| us(c.residual_p50_ns)),
+                residual_p99_us: clock.map_or(0.0, |c| us(c.residual_p99_ns)),
+                uncertain_frames: books.uncertain,
+            },
+            in_sets,
+        }
+    }
+}
+
+/// Whether a stream of this name is computed from others.
+pub fn is_derived(stream: &StreamName) -> bool {
+    [REFINED, ALIGNED].contains(&stream.as_str())
 }
 
 impl Books {

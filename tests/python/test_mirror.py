@@ -18,7 +18,7 @@ import depthrig
 import numpy as np
 import pytest
 from test_daemon import WAIT_S, binary
-from test_hosts import Rig, two_computers, wait_for
+from test_hosts import HOST_CAMERAS, Rig, two_computers, wait_for
 from test_link_clock import SHIFT_NS
 
 __all__ = ["binary"]
@@ -128,7 +128,22 @@ def test_frames_are_here_as_they_are_there(rig: Rig) -> None:
     # Readers here are no readers there, and the other way round.
     listed = {"moving/color", "moving/depth"}
     wait_for("the streams in the list", lambda: listed <= set(depthrig.streams("mount", rig.runtime["here"])))
+    one_moment(rig)
     nobody_reads(rig)
+
+
+def one_moment(rig: Rig) -> None:
+    """Frames of both computers at one moment, as a policy reads them: cameras that run freely at 30 Hz."""
+    own = f"{HOST_CAMERAS['here'][0].name}/color"
+    with depthrig.SetReader([own, *STREAMS], "mount", rig.runtime["here"], timeout=WAIT_S) as reader:
+        skews = []
+        for _ in range(30):
+            with reader.next(timeout=WAIT_S) as group:
+                times = group.capture_times_ns
+                assert group.is_complete and group.skew_s <= 0.05
+                skews += [abs(times[own] - times[stream]) / 1e9 for stream in STREAMS]
+    # Half of a period, and what the offset of the clocks may be wrong by, unless this computer was busy.
+    assert np.median(skews) < 0.020, skews
 
 
 def nobody_reads(rig: Rig) -> None:

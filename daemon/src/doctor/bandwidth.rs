@@ -7,7 +7,7 @@ use super::finding::{Finding, Severity};
 use super::host::Host;
 use super::plan::CameraPlan;
 use crate::attached::Attached;
-use crate::stage;
+use crate::stream;
 use depthrig_bus::Layout;
 use depthrig_driver::StreamProfile;
 use depthrig_libusb as libusb;
@@ -158,7 +158,7 @@ pub(super) fn check(links: &[LinkLoad], findings: &mut Vec<Finding>) {
 /// The libusb path: the memory of its transfers against the kernel's limit.
 pub(super) fn check_usbfs(plans: &[CameraPlan], host: &Host, findings: &mut Vec<Finding>) {
     let over: Vec<_> = plans.iter().filter(|p| p.libusb).collect();
-    let captured = over.iter().flat_map(|p| &p.profiles).filter(|(p, _)| !stage::is_derived(&p.stream));
+    let captured = over.iter().flat_map(|p| &p.profiles).filter(|(p, _)| !stream::is_derived(&p.stream));
     let own: u64 = captured.map(|(p, _)| transfer_bytes(p)).sum();
     let needed = own + plans.iter().map(|p| p.transfer_bytes).sum::<u64>();
     if needed == 0 {

@@ -2,13 +2,14 @@
 
 use crate::config::HostConfig;
 use crate::stage::{self, Intake, Readers, Refinement, Setup};
-use crate::status::{CameraState, HostRefineStatus, RigStatus};
+use crate::status::{CameraState, HostRefineStatus, RigStatus, SetAccount, StreamStatus};
 use crate::stream::Stream;
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::sync::lock;
 use depthrig_bus::{
-    Bus, CameraName, ClockDomain, FrameHeader, MetadataLevel, PixelFormat, StreamId, StreamName, Subscriber,
+    Bus, CameraName, ClockDomain, FrameHeader, HostTime, MetadataLevel, PixelFormat, StreamId, StreamName,
+    Subscriber,
 };
 use depthrig_cdm::stage::RefineConfig;
 use depthrig_driver::{DeviceClock, StreamProfile};
@@ -56,6 +57,18 @@ impl HostRefine {
     pub(super) fn status(&self) -> HostRefineStatus {
         let refine = self.refinement.get().map(|refinement| refinement.status());
         HostRefineStatus { camera: self.camera.to_string(), refine }
+    }
+
+    /// Whether it is the camera of this name.
+    pub(super) fn is_of(&self, camera: &str) -> bool {
+        self.camera.as_str() == camera
+    }
+
+    /// The streams that are made of it, once they are.
+    pub(super) fn streams(&self) -> Vec<StreamStatus> {
+        let now = HostTime::now();
+        let made = self.refinement.get().into_iter().flat_map(|refinement| refinement.streams());
+        made.map(|stream| stream.status(SetAccount::default(), now)).collect()
     }
 
     /// Gives the camera to the stage, once it streams `there` and frames of both streams come; a reason against it is logged.

@@ -6,7 +6,6 @@ use crate::control::{
 };
 use crate::losses::RecordingLosses;
 use crate::recording::{self, Begun, StreamFacts};
-use crate::rig::report;
 use crate::status::{
     CameraState, CameraStatus, RecordingStatus, ReplayStatus, RigStatus, SetAccount, SetStatus,
     SharedMemoryStatus,
@@ -113,7 +112,7 @@ impl Inner {
         for ((id, model, serial, calibration), stream) in images.chain(units).zip(streams) {
             let name = id.camera.to_string();
             let used = stream.books().delivered;
-            let status = report::stream(stream, SetAccount { used, ..SetAccount::default() }, now);
+            let status = stream.status(SetAccount { used, ..SetAccount::default() }, now);
             if let Some(camera) = cameras.iter_mut().find(|c| c.name == name) {
                 camera.streams.push(status);
                 continue;
@@ -140,7 +139,7 @@ impl Inner {
             let name = refinement.camera.to_string();
             let Some(camera) = cameras.iter_mut().find(|c| c.name == name) else { continue };
             camera.refine = Some(refinement.status());
-            let status = |s: &Arc<crate::stream::Stream>| report::stream(s, SetAccount::default(), now);
+            let status = |s: &Arc<crate::stream::Stream>| s.status(SetAccount::default(), now);
             camera.streams.extend(refinement.streams().map(status));
         }
         cameras

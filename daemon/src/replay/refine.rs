@@ -16,7 +16,7 @@ use std::sync::Arc;
 pub fn refinements(inner: &Inner, bus: &Bus, engine: EngineChoice) -> Result<Vec<Arc<Refinement>>> {
     let config = RefineConfig { engine, rate_hz: 0.0, ..RefineConfig::default() };
     let bad = |what: String| Error::new(ErrorKind::BadInput, what);
-    if let Some(had) = inner.records.iter().find(|r| stage::is_derived(&r.id.stream)) {
+    if let Some(had) = inner.records.iter().find(|r| crate::stream::is_derived(&r.id.stream)) {
         return Err(bad(format!("the dataset has {} of its own; replay it without --refine", had.id)));
     }
     let of = |camera: &StreamRecord, name: &str| {

@@ -2,14 +2,12 @@
 
 use super::Inner;
 use crate::camera::{Camera, State};
-use crate::stage;
 use crate::status::{
-    CameraState, CameraStatus, ClockStatus, PreparingStatus, RecordingStatus, RefineState, RigStatus,
-    SetAccount, SetStatus, SharedMemoryStatus, SkewStatus, StreamStatus,
+    CameraState, CameraStatus, PreparingStatus, RecordingStatus, RefineState, RigStatus, SetStatus,
+    SharedMemoryStatus, SkewStatus,
 };
-use crate::stream::Stream;
 use depthrig_bus::sync::lock;
-use depthrig_bus::{ClockDomain, HostTime, UtcPair, shm};
+use depthrig_bus::{HostTime, UtcPair, shm};
 use depthrig_recorder::{Diagnostic, Level};
 use depthrig_sim::synthetic::DrawingProgress;
 use std::sync::atomic::Ordering;
@@ -121,7 +119,7 @@ fn camera(inner: &Inner, camera: &Camera, now: HostTime) -> CameraStatus {
             .all_streams()
             .map(|s| {
                 // The account is older than the books that are read here, and never ahead of them.
-                let mut status = stream(s, accounts.streams.get(&s.id).copied().unwrap_or_default(), now);
+                let mut status = s.status(accounts.streams.get(&s.id).copied().unwrap_or_default(), now);
                 status.in_sets = status.in_sets.with_delivered(status.delivered);
                 status
             })
@@ -140,47 +138,6 @@ fn silent_units<'s>(inner: &'s Inner, state: &'s State, now: HostTime) -> impl I
         (silent_s > stall_s.max(3.0 / s.profile.rate_hz))
             .then(|| format!("no motion samples of {} for {silent_s:.1} s; its images go on", s.id.stream))
     })
-}
-
-/// A stream in numbers.
-pub fn stream(stream: &Stream, in_sets: SetAccount, now: HostTime) -> StreamStatus {
-    let p = &stream.profile;
-    let books = stream.books();
-    let clock = books.clock.as_ref();
-    let us = |ns: i64| ns as f64 / 1e3;
-    StreamStatus {
-        id: stream.id.to_string(),
-        derived: stage::is_derived(&stream.id.stream),
-        format: p.format.name().to_owned(),
-        width: p.width,
-        height: p.height,
-        nominal_hz: p.rate_hz,
-        rate_hz: books.rate_hz(now),
-        samples_hz: p.format.is_motion().then(|| books.samples_hz(now)),
-        captured: books.captured,
-        delivered: books.delivered,
-        dropped: books.dropped.nonzero().map(|(r, n)| (r.name().to_owned(), n)).collect(),
-        last_frame_age_ms: books.last_frame.map(|t| now.since_ns(t) as f64 / 1e6),
-        latency_p50_ms: books.latency_ms(0.5),
-        latency_p99_ms: books.latency_ms(0.99),
-        clock: ClockStatus {
-            domain: match p.clock.domain {
-                ClockDomain::Device => "device",
-                ClockDomain::Kernel => "kernel",
-                _ => "arrival",
-            }
-            .to_owned(),
-            metadata: books.metadata.unwrap_or(p.metadata).name().to_owned(),
-            metadata_lost: books.metadata_lost,
-            epoch: books.epoch,
-            rate_ppm: clock.map_or(0.0, |c| c.rate_ppm),
-            uncertainty_us: books.uncertainty_ns as f64 / 1e3,
-            residual_p50_us: clock.map_or(0.0, |c| us(c.residual_p50_ns)),
-            residual_p99_us: clock.map_or(0.0, |c| us(c.residual_p99_ns)),
-            uncertain_frames: books.uncertain,
-        },
-        in_sets,
-    }
 }
 
 /// The status as `diagnostic_msgs` see it: one entry per camera and one for the sets.

@@ -1,6 +1,6 @@
 //! The other computers of a rig, as the one that records sees them.
 
-use super::RefineStatus;
+use super::{CameraStatus, RefineStatus};
 use serde::{Deserialize, Serialize};
 
 /// The other computers, and what became of their parts of the newest recording.
@@ -23,7 +23,7 @@ impl HostsStatus {
 }
 
 /// Another computer of the rig.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct HostStatus {
     /// Its name in the rig.
     pub host: String,
@@ -43,6 +43,9 @@ pub struct HostStatus {
     pub mirrors: Vec<MirrorStatus>,
     /// Its cameras whose depth is refined on this computer.
     pub refined: Vec<HostRefineStatus>,
+    /// Its cameras with the streams that are on the bus of this computer: accounts are those of its own daemon at the last look, rates those of this
+    /// one, and a camera is stalled while its frames do not come here.
+    pub mirrored: Vec<CameraStatus>,
 }
 
 /// A camera of another computer whose depth is refined on this one.

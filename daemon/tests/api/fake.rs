@@ -183,6 +183,7 @@ impl Fake {
                         skipped: 3,
                     }],
                     refined: vec![HostRefineStatus { camera: "wrist".into(), refine: None }],
+                    mirrored: vec![CameraStatus { name: "wrist".into(), ..CameraStatus::default() }],
                     host: "top".into(),
                     state: HostState::Refused,
                     why: Some("its rig is \"other\"".into()),
