@@ -49,11 +49,12 @@ test: setup-test environments ## every test: Rust, Python, third-party readers, 
 	@tools/onnxruntime.sh || true
 	tools/test.sh
 
-test-long: ## the long forms: every test with DEPTHRIG_LONG=1, ten minutes of recording, twelve of the daemon, an hour of fuzzing per target
+test-long: ## the long forms: every test with DEPTHRIG_LONG=1, ten minutes of recording, twelve of the daemon, a second computer, an hour of fuzzing per target
 	DEPTHRIG_LONG=1 $(MAKE) test
 	cargo build --release --package depthrig
 	target/release/depthrig bench soak --check
 	tests/soak.py target/release/depthrig
+	tests/vm/second_host
 	$(MAKE) fuzz
 
 vm: setup-build setup-vm $(VENV)/.stamp ## drivers and daemon on a real kernel, in a virtual machine; one scenario: make vm ARGS="vivid-smoke"

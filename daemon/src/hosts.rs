@@ -50,6 +50,8 @@ use std::sync::{Arc, Condvar, Mutex, PoisonError};
 /// Makes one dataset of others ([`crate::joining`]).
 pub type JoinParts = fn(&[PathBuf], &Path, &RuntimeDir, &AtomicBool) -> Result<u64>;
 
+/// The folder of the channels over which parts are joined, below that of the user's rigs.
+pub const JOINING: &str = "joining";
 /// From one look at a host to the next while nothing is pulled from it.
 const LOOK: Duration = Duration::from_millis(500);
 /// A host that was just reached gets the key of the clock first, and begins its part when it knows the clock, or after so long all the same.
@@ -136,7 +138,7 @@ impl Hosts {
     /// an earlier daemon did not pull are found again.
     ///
     /// # Errors
-    /// Those of a link to a socket that cannot be made.
+    /// Those of a link to a socket that cannot be made, and of a folder for joining, which is tried now and not at the end of the first recording.
     pub fn new(
         config: &RigConfig,
         runtime: &RuntimeDir,
@@ -145,6 +147,7 @@ impl Hosts {
         key: Option<Key>,
     ) -> Result<Option<Self>> {
         let Some(link) = config.link.as_ref().filter(|link| !link.hosts.is_empty()) else { return Ok(None) };
+        RuntimeDir::at(&runtime.path().join(JOINING))?;
         for host in &link.hosts {
             let here = runtime.host_socket_path(&config.rig, &host.name);
             let _ = std::fs::remove_file(&here);

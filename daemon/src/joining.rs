@@ -6,6 +6,7 @@
 
 use crate::config::RecordingConfig;
 use crate::control::RecordRequest;
+use crate::hosts::JOINING;
 use crate::recording::reserve_bytes;
 use crate::replay::{Replay, ReplayOptions};
 use crate::{Error, ErrorKind, Result};
@@ -22,8 +23,6 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 /// The folder beside the recordings in which a joined dataset grows.
 const FOLDER: &str = ".joining";
-/// The folder of the replay's channels, below that of the user's rigs.
-const CHANNELS: &str = "joining";
 /// From one look whether to stop to the next.
 const LOOK: Duration = Duration::from_millis(100);
 
@@ -50,7 +49,7 @@ pub fn join(parts: &[PathBuf], out: &Path, runtime: &RuntimeDir, stop: &AtomicBo
         return Err(Error::new(ErrorKind::BadInput, "none of the parts has a set"));
     }
     let parts = parts.as_slice();
-    let channels = RuntimeDir::at(&runtime.path().join(CHANNELS))?;
+    let channels = RuntimeDir::at(&runtime.path().join(JOINING))?;
     let hidden = out.with_file_name(FOLDER);
     let failed = |path: &Path, e: std::io::Error| {
         Error::new(ErrorKind::Other, format!("{}: {e}", path.display())).with_source(e)

@@ -227,15 +227,19 @@ def test_a_killed_capture_goes_on_where_it_was(binary: str, runtime: Path, mount
 
 
 def test_a_recording_gives_the_views_that_it_has(binary: str, runtime: Path, mount: Path, tmp_path: Path) -> None:
-    recording = mount / "datasets" / "recording"
-    command(binary, runtime, "--rig", "mount", "record", "start", "--name", "recording")
-    time.sleep(9.0)
-    command(binary, runtime, "--rig", "mount", "record", "stop", codes=(0, 3))
     board = str(mount / "board.toml")
-    views = tmp_path / "views"
-    # Something is missing, and it says what.
-    events = captured(binary, runtime, str(recording), "--board", board, "-o", str(views), codes=(3,))
-    count = events[-1]["progress"]["views"]
+    # A computer that is very busy loses so many frames that the board is hardly seen at rest.
+    for seconds in (9, 20, 40):
+        recording = mount / "datasets" / f"recording_{seconds}"
+        command(binary, runtime, "--rig", "mount", "record", "start", "--name", recording.name)
+        time.sleep(seconds)
+        command(binary, runtime, "--rig", "mount", "record", "stop", codes=(0, 3))
+        views = tmp_path / f"views_{seconds}"
+        # Something is missing, and it says what.
+        events = captured(binary, runtime, str(recording), "--board", board, "-o", str(views), codes=(3,))
+        count = events[-1]["progress"]["views"]
+        if count >= 3:
+            break
     assert 3 <= count <= 9
     assert any("of 10 views" in m for m in events[-1]["progress"]["missing"])
     command(binary, runtime, "verify", str(views))

@@ -87,8 +87,8 @@ def wait_for_sets(recording: depthrig.Recording, more: int) -> None:
 
 
 def wait_until_rendered(binary: str, runtime: Path) -> None:  # noqa: F811
-    """Until the images are no longer sketches."""
-    deadline = time.monotonic() + WAIT_S
+    """Until the images are no longer sketches. They are rendered below the priority of all else that runs."""
+    deadline = time.monotonic() + 5 * WAIT_S
     while True:
         asked = [binary, "status", "--json"]
         done = subprocess.run(asked, env=environment(runtime), capture_output=True, text=True, timeout=WAIT_S, check=False)

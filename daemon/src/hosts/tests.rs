@@ -1,8 +1,9 @@
+use super::Hosts;
 use super::pull::{Pull, Pulled};
 use super::session::Sessions;
 use crate::api::{self, ServerHandle};
 use crate::client::Client;
-use crate::config::ControlConfig;
+use crate::config::{ControlConfig, RigConfig};
 use crate::control::{Control, EpisodeRequest, RecordRequest};
 use crate::status::{JoinState, RecordingStatus, RigStatus};
 use crate::{Error, ErrorKind, Result};
@@ -360,4 +361,20 @@ fn a_recording_that_ends_by_itself_ends_its_parts() {
     sessions.follow(None);
     assert!(sessions.is_over("one_left"));
     assert!(!sessions.is_over("two_left"), "whatever else a host records is its own");
+}
+
+#[test]
+fn a_folder_without_room_for_joining_is_refused_at_the_start() {
+    let text = "rig = \"mount\"\n[link]\nhost = \"right\"\nlisten = \"127.0.0.1:7447\"\n[[link.hosts]]\nname = \"left\"\nsocket = \"/left.sock\"\n\
+                [[camera]]\nname = \"a\"\nbackend = \"synthetic\"\nmodel = \"generic\"\n";
+    let config = RigConfig::parse(text, None).unwrap();
+    let tmp = tempfile::Builder::new().prefix("dh").rand_bytes(4).tempdir_in("/tmp").unwrap();
+    let new = |len: usize| {
+        let name = "r".repeat(len - tmp.path().as_os_str().len() - 1);
+        let runtime = RuntimeDir::at(&tmp.path().join(name)).unwrap();
+        Hosts::new(&config, &runtime, None, Arc::default(), None).map(|hosts| hosts.map(|h| h.count()))
+    };
+    assert_eq!(new(32).unwrap(), Some(1));
+    let refused = new(33).unwrap_err().to_string();
+    assert!(refused.contains("/joining: the path is longer than 40 bytes"), "{refused}");
 }

@@ -14,7 +14,7 @@ from .kernel import Kernel, call, locked
 INIT = Path(__file__).parents[1] / "init"
 # What scenarios may load with `system::modprobe`, and what init loads; each with what it depends on.
 MODULES = (
-    "virtio_pci 9pnet_virtio 9p virtio_rng uvcvideo vivid vhci-hcd usbhid hid-generic hid-sensor-hub hid-sensor-accel-3d "
+    "virtio_pci virtio_net 9pnet_virtio 9p virtio_rng uvcvideo vivid vhci-hcd usbhid hid-generic hid-sensor-hub hid-sensor-accel-3d "
     "hid-sensor-gyro-3d usbmon".split()
 )
 FOLDERS = "bin dev etc lib lib64 proc root run share sys tmp var/tmp".split()

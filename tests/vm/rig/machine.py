@@ -11,6 +11,8 @@ QEMU = "qemu-system-x86_64"
 # Guest time is the number of instructions executed, one nanosecond each, and an idle guest jumps to its next timer:
 # however busy the host is, the guest does not notice. One processor, because only one thread can count.
 CLOCK = "-accel tcg,thread=single -icount shift=0,sleep=off -rtc clock=vm -smp 1".split()
+# Where another computer is on the network: time passes as it does there.
+REAL_TIME = "-accel tcg -rtc clock=host -smp 1".split()
 # Without cx16 and la57: QEMU 7.2 has crashed an early boot after a cmpxchg16b. Without erms, fsrm and avx: with them
 # the guest copies memory byte by byte, each byte emulated.
 CPU = "-cpu max,-cx16,-la57,-erms,-fsrm,-avx".split()
@@ -36,7 +38,8 @@ class Boot:
 class Machine:
     """A virtual machine that is running."""
 
-    def __init__(self, vmlinux: Path, archives: list[Path], share: Path, memory_mib: int, shell: bool = False):
+    def __init__(self, vmlinux: Path, archives: list[Path], share: Path, memory_mib: int, shell: bool = False, forward: str = ""):
+        """With `forward`, such as `tcp:127.0.0.1:2222-:22`, it has a network and real time, and runs `script` of the shared folder."""
         initrd = share / "initrd"
         with initrd.open("wb") as out:  # the kernel unpacks archives that follow each other
             for archive in archives:
@@ -46,12 +49,13 @@ class Machine:
         self.console = share / "console.log"
         self.started = time.monotonic()
         command = [
-            QEMU, "-M", "q35", *CLOCK, *CPU, "-m", str(memory_mib),
+            QEMU, "-M", "q35", *(REAL_TIME if forward else CLOCK), *CPU, "-m", str(memory_mib),
             "-nodefaults", "-no-user-config", "-no-reboot", "-display", "none", "-serial", "stdio",
             "-kernel", vmlinux, "-initrd", initrd,
-            "-append", COMMAND_LINE + (" depthrig.shell" if shell else ""),
+            "-append", COMMAND_LINE + (" depthrig.shell" if shell else "") + (" depthrig.script" if forward else ""),
             "-fsdev", f"local,id=share,path={share},security_model=none",
             "-device", "virtio-9p-pci,fsdev=share,mount_tag=share",
+            *(["-netdev", f"user,id=net,hostfwd={forward}", "-device", "virtio-net-pci,netdev=net"] if forward else []),
         ]  # fmt: skip
         if shell:
             self.process = subprocess.Popen([str(part) for part in command])
