@@ -34,7 +34,7 @@ from depthrig._header import Intrinsics
 from depthrig.ros2 import _cloud, _images, _names, _session, _types
 from depthrig.ros2._inbound_signal import signal_name
 from depthrig.ros2._types import CAMERA_INFO, COMPRESSED, DIAGNOSTICS, IMAGE, IMU, JOINTS, POINTS, POSE, TRANSFORMS
-from ros2 import Bridge, Bus, Router, bridge, decode, definition, free_port, stamp_ns, until, utc_offset_ns
+from ros2 import STAMP_NS, Bridge, Bus, Heard, Router, bridge, decode, definition, free_port, stamp_ns, until, utc_offset_ns
 
 __all__ = ["binary", "runtime"]
 
@@ -115,6 +115,8 @@ def test_keys_and_tokens_are_written_as_rmw_zenoh_does() -> None:
     sent = bytes.fromhex("0900000000000000df8ab6f7e735d31810fe98e4a3b54b6e599c5934f4cfc25343")
     utc_ns = int.from_bytes(sent[8:16], "little")
     assert _names.attachment(9, utc_ns, sent[17:]) == sent and 1.7e18 < utc_ns < 1.9e18
+    # The published XXH3 of nothing is 99aa06d3014798d8 6001c324468d497f; its lower half comes first, each in the computer's order.
+    assert _names.identity("").hex() == "7f498d4624c30160d8984701d306aa99"
     for later in (token, f"{token}/buffers"):
         assert _names.published_types(later) == ("/chatter", "std_msgs::msg::dds_::String_")
     for other in (token.replace("/MP/", "/MS/"), "@ros2_lv/2", "", _names.node_token(2, "a", "b")):
@@ -319,6 +321,55 @@ def test_every_sample_of_an_imu_is_sent(node: Bridge, router: Router, runtime: P
         assert (message.orientation_covariance[0], message.angular_velocity_covariance[0]) == (-1, 0)
 
 
+def numbers(heard: Heard) -> np.ndarray:
+    """Numbers of the messages that came; those that are missing were lost on their way."""
+    return np.array([int.from_bytes(a[:8], "little") for a in list(heard.attachments)])
+
+
+def stand_still(node: Bridge, seconds: float = 1.5) -> None:
+    node.process.send_signal(signal.SIGSTOP)
+    time.sleep(seconds)
+
+
+def test_after_a_pause_the_newest_image_comes_and_the_others_are_counted(node: Bridge, router: Router, runtime: Path) -> None:
+    topic = f"{TOP}/color/image_raw"
+    before = node.status()["topics"][topic]["skipped"]
+    with Bus(runtime, "top/color", "cell") as bus, router.hear(topic, IMAGE) as heard:
+        heard.wait(3)
+        stand_still(node)
+        newest = max(seen.header.sequence for seen in list(bus.frames.values()))
+        node.process.send_signal(signal.SIGCONT)
+        messages = heard.wait(len(heard.payloads) + 8)
+        lost = int((np.diff(numbers(heard)[: len(messages)]) - 1).sum())
+        frames = [bus.at(stamp_ns(message)).header.sequence for message in messages]
+    steps = np.diff(frames)
+    after = int(steps.argmax()) + 1
+    assert steps.max() > 10 and frames[after] >= newest, (frames, newest)
+    skipped = node.wait(lambda s: not s["topics"][topic]["subscribed"], "not subscribed any more")["topics"][topic]["skipped"]
+    # Since the last message a few more may have been.
+    assert 0 <= skipped - before - (int((steps - 1).sum()) - lost) <= 2, (frames, lost, skipped - before)
+
+
+def test_after_a_pause_every_sample_comes_that_the_channel_kept_and_the_others_are_counted(node: Bridge, router: Router, runtime: Path) -> None:
+    topic = f"{TOP}/imu/data_raw"
+    before = node.status()["topics"][topic]["missed"]
+    with Bus(runtime, "top/imu", "cell") as bus, router.hear(topic, IMU) as heard:
+        heard.wait(200)
+        stand_still(node)
+        kept = [seen.array for _, seen in sorted(bus.frames.items())][-3:]
+        node.process.send_signal(signal.SIGCONT)
+        messages = heard.wait(len(heard.payloads) + 400)
+        lost = int((np.diff(numbers(heard)[: len(messages)]) - 1).sum())
+        samples = np.concatenate([seen.array for _, seen in sorted(bus.frames.items())])
+    stamps = np.array([stamp_ns(message) for message in messages]) - utc_offset_ns()
+    passed = int(((samples["time_ns"] > stamps[0] - STAMP_NS) & (samples["time_ns"] < stamps[-1] + STAMP_NS)).sum())
+    missed = node.status()["topics"][topic]["missed"] - before
+    assert missed > 0 and abs(passed - len(messages) - lost - missed) <= 1, (passed, len(messages), lost, missed)
+    # Of the last ones before it went on none is missing.
+    for time_ns in np.concatenate(kept)["time_ns"] if lost == 0 else ():
+        assert np.abs(stamps - time_ns).min() < STAMP_NS, "a sample that the channel kept"
+
+
 def test_diagnostics_have_the_cameras_and_this_program(node: Bridge, router: Router) -> None:
     with router.hear("/diagnostics", DIAGNOSTICS) as heard:
         message = heard.wait(2)[-1]
@@ -376,6 +427,34 @@ def test_every_sample_of_a_signal_is_sent(node: Bridge, router: Router, runtime:
     until(
         lambda: not any("%joint_states" in t and "/MP/" in t for t in router.tokens), "the topic goes with the signal"
     )
+
+
+def test_samples_of_a_signal_that_were_replaced_before_they_were_read_are_counted(node: Bridge, router: Router, runtime: Path) -> None:
+    topic = "/cell/arm/fast/joint_states"
+    with (
+        depthrig.Signal("arm/fast", ["n"], unit="rad", kind="joints", runtime_dir=runtime) as fast,
+        router.hear(topic, JOINTS) as heard,
+    ):
+        published = 0
+
+        def publish() -> int:
+            nonlocal published
+            published += 1
+            fast.publish([float(published)])
+            return published
+
+        until(lambda: publish() and heard.payloads, "the first")
+        stand_still(node, 0)
+        while publish() < 3000:
+            pass
+        node.process.send_signal(signal.SIGCONT)
+        until(lambda: decode(JOINTS, heard.payloads[-1]).position[0] == 3000, "the last")
+        values = np.array([message.position[0] for message in heard.messages()])
+        lost = int((np.diff(numbers(heard)) - 1).sum())
+        missed = node.wait(lambda s: s["topics"][topic]["missed"], "samples are missed")["topics"][topic]["missed"]
+    # The channel keeps 512.
+    assert len(values) + lost >= 512 and np.all(np.diff(values) > 0)
+    assert len(values) + lost + missed == 3000 - values[0] + 1, (len(values), lost, missed, values[0])
 
 
 def joint_state(names: list[str], values: list[float], utc_ns: int, velocity: tuple[float, ...] = ()) -> bytes:

@@ -81,10 +81,13 @@ class StreamFeed(Feed):
             if not wanted:
                 return
             try:
-                # Of images the newest, of an IMU every batch.
-                frame = (None if is_motion else stream.latest()) or stream.next(SLICE_S)
+                frame = stream.next(SLICE_S)
             except Timeout:
                 continue
+            # Of images the newest, of an IMU every batch.
+            if not is_motion and (newest := stream.latest()) is not None:
+                frame.release()
+                frame = newest
             with frame:
                 self.read += 1
                 self._poses.place(self._frame_id, frame.header.pose)
