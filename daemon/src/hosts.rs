@@ -6,7 +6,7 @@
 //!
 //! ```text
 //! session  the recordings with parts elsewhere, and a file beside each that says so
-//! visit    what one look at a host's status leads to: begin, stop, pull
+//! visit    what one look at a host's status leads to, and pulling beside it
 //! mirrored its cameras, as they are seen here
 //! pull     segments by ranges of bytes, resumed where they ended, compared at the end
 //! ```
@@ -189,7 +189,7 @@ impl Hosts {
         }))
     }
 
-    /// Number of hosts; each has a thread of its own.
+    /// Number of hosts; each has two threads of its own.
     pub const fn count(&self) -> usize {
         self.others.len()
     }
@@ -253,36 +253,57 @@ impl Hosts {
         let client = Client::of_host(&self.runtime, &self.rig, &host.config.name)?;
         let tunnel = self.tunnel(host)?;
         let mut connected_since = None;
+        let mut may_begin = true;
         while !stop.load(Ordering::Relaxed) {
             let mut sessions = lock(&self.sessions);
             // Under the lock: a session is added after its recording has become active.
             sessions.follow(active().as_deref());
             drop(sessions);
+            if host.is_connected() {
+                // By what was seen last: the next answer may come late, behind what is pulled.
+                self.visit(host, &client, may_begin);
+            }
             let looked = client.status();
             let is_new = self.note(host, looked.as_ref(), tunnel.as_ref());
-            let mut is_busy = false;
-            let mut may_begin = true;
             if let Ok(status) = &looked
                 && host.is_connected()
             {
                 self.lead(host, &client);
                 let since = *connected_since.get_or_insert_with(HostTime::now);
                 may_begin = lock(&host.seen).has_clock || since.elapsed() >= CLOCK_WAIT;
-                is_busy = self.visit(host, &client, status, may_begin, stop);
+                self.visit(host, &client, may_begin);
                 host.begin_refined(status, place);
             } else {
                 connected_since = None;
+                may_begin = true;
             }
             if is_new {
                 self.changed.notify_all();
             }
-            if !is_busy {
-                let sessions = lock(&self.sessions);
-                let pause = if may_begin { LOOK } else { CLOCK_LOOK };
-                drop(self.changed.wait_timeout(sessions, pause).unwrap_or_else(PoisonError::into_inner));
+            self.wait_for_change(if may_begin { LOOK } else { CLOCK_LOOK });
+        }
+        Ok(())
+    }
+
+    /// Pulls what host `number` records until `stop`, in another thread than [`Self::keep`]: a recording begins and ends there at once, however
+    /// slow the way is.
+    ///
+    /// # Errors
+    /// When no client can be made.
+    pub fn pull(&self, number: usize, stop: &AtomicBool) -> Result<()> {
+        let Some(host) = self.others.get(number) else { return Ok(()) };
+        let client = Client::of_host(&self.runtime, &self.rig, &host.config.name)?;
+        while !stop.load(Ordering::Relaxed) {
+            if !host.is_connected() || !self.pull_parts(host, &client, stop) {
+                self.wait_for_change(LOOK);
             }
         }
         Ok(())
+    }
+
+    fn wait_for_change(&self, at_most: Duration) {
+        let sessions = lock(&self.sessions);
+        drop(self.changed.wait_timeout(sessions, at_most).unwrap_or_else(PoisonError::into_inner));
     }
 
     /// Number of streams of all hosts whose frames come here; each has a thread of its own.
@@ -417,8 +438,7 @@ impl Hosts {
                 !matches!(look_at(&RealFs, folder).health, Health::Recording | Health::Unfinished)
             });
             let Some(session) = due else {
-                let sessions = lock(&self.sessions);
-                drop(self.changed.wait_timeout(sessions, LOOK).unwrap_or_else(PoisonError::into_inner));
+                self.wait_for_change(LOOK);
                 continue;
             };
             let out = session.joined_folder();

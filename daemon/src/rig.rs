@@ -370,7 +370,7 @@ impl Rig {
         Ok(())
     }
 
-    /// A thread for each other computer, one for each of their streams that come here, and one that joins what they recorded.
+    /// Two threads for each other computer, one for each of their streams that come here, and one that joins what they recorded.
     fn keep_hosts(&mut self) -> Result<()> {
         let Some(hosts) = self.inner.hosts.clone() else { return Ok(()) };
         for number in 0..hosts.count() {
@@ -380,6 +380,14 @@ impl Rig {
                 let place = Place { bus: &inner.shared.bus, intake: &inner.shared.stage };
                 let kept = hosts.keep(number, &|| inner.recording().active_path(), place, stop);
                 if let Err(e) = kept {
+                    tracing::error!("{e}");
+                }
+            })?;
+        }
+        for number in 0..hosts.count() {
+            let hosts = Arc::clone(&hosts);
+            self.spawn("pull", move |stop| {
+                if let Err(e) = hosts.pull(number, stop) {
                     tracing::error!("{e}");
                 }
             })?;

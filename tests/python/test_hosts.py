@@ -410,3 +410,20 @@ def test_a_computer_that_cannot_be_part_of_the_rig_is_named_and_left_alone(
     rig.ask("record", "stop")
     assert rig.session()["parts"] == []
     assert not rig.data("there").exists() or not any(rig.data("there").iterdir())
+
+
+def test_a_part_ends_and_begins_with_the_recording_while_a_slow_wire_pulls(binary: str, tmp_path: Path) -> None:  # noqa: F811
+    with two_computers(binary, tmp_path, "10mbit") as rig:
+        rig.start("here")
+        rig.start("there")
+        wait_for("the clock", lambda: rig.host()["has_clock"])
+        for name in ("first", "second"):
+            rig.ask("record", "start", "--name", name)
+            time.sleep(5)
+            rig.ask("record", "stop")
+            here, there = ([v.tick_ns for topic, v, _ in messages(rig.data(host) / folder) if topic == "/mount/frame_set"]
+                           for host, folder in (("here", name), ("there", f"{name}_left")))  # fmt: skip
+            # Its rest is on the way when the next one begins.
+            assert not rig.session()["parts"][0]["is_complete"]
+            for seconds in ((there[i] - SHIFT_NS - here[i]) / 1e9 for i in (0, -1)):
+                assert abs(seconds) < 1, f"{name}: the part is {seconds} s later"

@@ -7,6 +7,7 @@
 use crate::api::{BytesRequest, FileRequest, MAX_PART_BYTES, RecordingFile, digest_of, is_served};
 use crate::client::Client;
 use crate::{Error, ErrorKind, Result};
+use core::time::Duration;
 use depthrig_bus::{HostTime, shm, umask};
 use depthrig_recorder::SESSION_FILE;
 use std::fs::{self, File, OpenOptions};
@@ -18,6 +19,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 const FOLDER: &str = ".pulling";
 /// The longest `session.toml`, as of any reader of datasets.
 const MAX_SESSION_BYTES: u64 = 16 << 20;
+
+/// The first piece that is asked for, bytes, and the smallest.
+const PIECE_BYTES: u64 = 128 << 10;
+/// Pieces become larger as long as they come within this: commands to the host wait behind one on a slow way.
+const PIECE_TIME: Duration = Duration::from_millis(100);
 
 /// A part, and for how long it is to be pulled.
 pub(super) struct Pull<'a> {
@@ -122,9 +128,11 @@ impl Pull<'_> {
             copy.set_len(0).map_err(failed)?;
             have = 0;
         }
+        let mut piece = PIECE_BYTES;
         while have < segment.bytes && !self.is_over() {
             self.must_have_room(folder)?;
-            let length = (segment.bytes - have).min(MAX_PART_BYTES);
+            let asked = HostTime::now();
+            let length = (segment.bytes - have).min(piece);
             let part =
                 BytesRequest { name: self.name.to_owned(), file: segment.file.clone(), offset: have, length };
             let bytes = match self.client.recording_bytes(&part) {
@@ -139,6 +147,16 @@ impl Pull<'_> {
             }
             copy.write_all(&bytes).map_err(failed)?;
             have += bytes.len() as u64;
+            let is_quick = asked.elapsed() < PIECE_TIME / 2;
+            let is_slow = asked.elapsed() > PIECE_TIME;
+            piece = if is_quick {
+                piece * 2
+            } else if is_slow {
+                piece / 2
+            } else {
+                piece
+            };
+            piece = piece.clamp(PIECE_BYTES, MAX_PART_BYTES);
         }
         pulled.copied += have;
         if !is_closed || have < segment.bytes {

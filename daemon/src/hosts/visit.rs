@@ -1,33 +1,25 @@
-//! Actions that follow from one look at a host.
+//! Actions that follow from one look at a host, and pulling what it records, which no action waits for.
 
 use super::pull::{Pull, Pulled};
 use super::session::Session;
 use super::{Host, Hosts};
 use crate::client::Client;
-use crate::status::RigStatus;
 use crate::{Error, Result};
 use core::time::Duration;
 use depthrig_bus::HostTime;
 use depthrig_bus::sync::lock;
 use std::sync::atomic::AtomicBool;
 
-/// Parts are pulled for so long before the host is looked at again.
+/// A part is pulled for so long before its files are listed again.
 const PULL_FOR: Duration = Duration::from_millis(500);
 
 impl Hosts {
-    /// Begins (if it `may_begin`) and ends parts on a host that was just looked at, and pulls some of them. Returns whether there is more to pull.
-    pub(super) fn visit(
-        &self,
-        host: &Host,
-        client: &Client,
-        status: &RigStatus,
-        may_begin: bool,
-        stop: &AtomicBool,
-    ) -> bool {
+    /// Begins (if it `may_begin`) and ends parts on a host, by what was seen of it last.
+    pub(super) fn visit(&self, host: &Host, client: &Client, may_begin: bool) {
         let name = &host.config.name;
-        let recorded = status.recording.as_ref().filter(|r| r.active).map(|r| r.name.as_str());
-        if let Some(part) = recorded
-            && lock(&self.sessions).is_over(part)
+        let recorded = || lock(&host.seen).recording.clone();
+        if let Some(part) = recorded()
+            && lock(&self.sessions).is_over(&part)
         {
             match client.record_stop() {
                 Ok(_) => self.recorded(host, None),
@@ -35,12 +27,23 @@ impl Hosts {
             }
             self.changed.notify_all();
         }
-        let mut is_busy = false;
         let sessions = lock(&self.sessions).of(name);
-        for session in &sessions {
-            if may_begin && session.goes_on && !session.parts.iter().any(|p| recorded == Some(&p.name)) {
-                self.begin_part(host, client, session, recorded);
+        let recorded = recorded();
+        for session in sessions.iter().filter(|session| may_begin && session.goes_on) {
+            if !session.parts.iter().any(|p| recorded.as_ref() == Some(&p.name)) {
+                self.begin_part(host, client, session, recorded.as_deref());
             }
+        }
+    }
+
+    /// Pulls some of each part that the host has. Returns whether there is more.
+    pub(super) fn pull_parts(&self, host: &Host, client: &Client, stop: &AtomicBool) -> bool {
+        let name = &host.config.name;
+        let mut is_busy = false;
+        // Both of before: a part that nobody records when its files are listed is not closed later.
+        let sessions = lock(&self.sessions).of(name);
+        let recorded = lock(&host.seen).recording.clone();
+        for session in &sessions {
             for part in session.parts.iter().filter(|p| p.host == *name && !p.is_complete) {
                 let pull = Pull {
                     client,
@@ -51,7 +54,7 @@ impl Hosts {
                     stop,
                 };
                 is_busy |= self.pulled(host, session, &part.name, pull.run());
-                if !session.goes_on && !is_busy && recorded != Some(&part.name) {
+                if !session.goes_on && !is_busy && recorded.as_ref() != Some(&part.name) {
                     self.left_open(session, &part.name);
                 }
             }
