@@ -373,6 +373,7 @@ def test_a_copy_that_was_damaged_is_pulled_again(rig: Rig) -> None:
             return copy.stem
         return None
 
+    wait_for("sets", lambda: rig.status()["recording"]["sets"] > 2)
     segment = wait_for("a copy", damaged)
     rig.ask("record", "stop")
     joined = rig.joined()
