@@ -52,7 +52,7 @@ pub type JoinParts = fn(&[PathBuf], &Path, &RuntimeDir, &AtomicBool) -> Result<u
 
 /// The folder of the channels over which parts are joined, below that of the user's rigs.
 pub const JOINING: &str = "joining";
-/// From one look at a host to the next while nothing is pulled from it.
+/// From one look at a host, or at what it has to pull, to the next.
 const LOOK: Duration = Duration::from_millis(500);
 /// A host that was just reached gets the key of the clock first, and begins its part when it knows the clock, or after so long all the same.
 const CLOCK_WAIT: Duration = Duration::from_secs(2);
