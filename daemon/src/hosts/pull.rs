@@ -38,6 +38,18 @@ pub(super) struct Pull<'a> {
     pub(super) stop: &'a AtomicBool,
 }
 
+/// Bytes of the next piece after one of `bytes` that took so long.
+fn next_piece(bytes: u64, took: Duration) -> u64 {
+    let next = if took < PIECE_TIME / 2 {
+        bytes * 2
+    } else if took > PIECE_TIME {
+        bytes / 2
+    } else {
+        bytes
+    };
+    next.clamp(PIECE_BYTES, MAX_PART_BYTES)
+}
+
 /// Progress of a part.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(super) struct Pulled {
@@ -61,7 +73,9 @@ impl Pull<'_> {
             // It got its place, and the daemon ended before it wrote that down.
             return Ok(Pulled { is_complete: true, ..Pulled::default() });
         }
+        let asked = HostTime::now();
         let listed = self.client.recording_files(self.name)?;
+        let turn = asked.elapsed();
         let (segments, session): (Vec<_>, Vec<_>) =
             listed.files.into_iter().partition(|file| file.file != SESSION_FILE);
         let folder = self.growing();
@@ -74,7 +88,7 @@ impl Pull<'_> {
                 let what = format!("a file of {} is called {:?}", self.name, segment.file);
                 return Err(Error::new(ErrorKind::BadInput, what));
             }
-            let is_here = self.segment(&folder, segment, &mut pulled)?;
+            let is_here = self.segment(&folder, segment, turn, &mut pulled)?;
             all &= is_here;
             if self.is_over() {
                 pulled.is_busy = !is_here || all;
@@ -105,8 +119,14 @@ impl Pull<'_> {
         self.until.from_now().is_zero() || self.stop.load(Ordering::Relaxed)
     }
 
-    /// Appends what its copy lacks; whether it is closed there and equal here.
-    fn segment(&self, folder: &Path, segment: &RecordingFile, pulled: &mut Pulled) -> Result<bool> {
+    /// Appends what its copy lacks; whether it is closed there and equal here. An answer without bytes takes `turn`.
+    fn segment(
+        &self,
+        folder: &Path,
+        segment: &RecordingFile,
+        turn: Duration,
+        pulled: &mut Pulled,
+    ) -> Result<bool> {
         let closed = segment.file.strip_suffix(".part").unwrap_or(&segment.file);
         let done = folder.join(closed);
         let growing = folder.join(format!("{closed}.part"));
@@ -263,4 +283,24 @@ fn remove_strangers(folder: &Path, segments: &[RecordingFile]) -> io::Result<()>
         }
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pieces_are_as_large_as_the_way_carries_in_a_tenth_of_a_second() {
+        for (bytes_s, least, most) in [
+            (100_000, PIECE_BYTES, PIECE_BYTES),
+            (12_500_000, 600_000, 1_250_000),
+            (125_000_000, MAX_PART_BYTES, MAX_PART_BYTES),
+        ] {
+            let mut piece = PIECE_BYTES;
+            for _ in 0..10 {
+                piece = next_piece(piece, Duration::from_secs_f64(piece as f64 / f64::from(bytes_s)));
+            }
+            assert!((least..=most).contains(&piece), "{bytes_s} bytes/s: {piece}");
+        }
+    }
 }
