@@ -58,3 +58,23 @@ impl Grid {
         lock(&self.others).insert(host.to_owned(), rhythms);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_computer_that_is_away_is_forgotten_after_some_minutes() {
+        let grid = Grid::default();
+        let rhythm = |newest_ns| Rhythm { newest_ns, period_ns: 1e9 / 30.0, tolerance_ns: 1 };
+        grid.set_other("left", vec![rhythm(1_000), rhythm(2_000)]);
+        grid.set_other("top", vec![rhythm(300_000_000_000)]);
+        let known = |ns| grid.others(HostTime::from_ns(ns)).len();
+        assert_eq!(known(KNOWN_FOR_NS), 3);
+        assert_eq!(known(KNOWN_FOR_NS + 1_500), 2);
+        assert_eq!(known(KNOWN_FOR_NS + 2_000), 1);
+        // What it says now replaces what it said.
+        grid.set_other("left", vec![rhythm(KNOWN_FOR_NS)]);
+        assert_eq!(known(KNOWN_FOR_NS + 2_000), 2);
+    }
+}

@@ -121,6 +121,18 @@ mod tests {
     }
 
     #[test]
+    fn no_stream_is_left_out_for_the_sake_of_the_others() {
+        // A frame of 5 Hz that is 20 ms from the tick at the most, beside one of 30 Hz: a tick elsewhere has a spread of 0, without it.
+        let slow = Rhythm { tolerance_ns: 20_000_000, ..at(50, 5.0) };
+        for tick_ms in (0..200).step_by(10) {
+            let tick = 1_000_000_000 + tick_ms * 1_000_000;
+            let to = tick + best_shift(tick, 200_000_000, 200_000_000, &[at(0, 30.0), slow]);
+            let off = slow.nearest(to as f64).abs();
+            assert!(off <= 20e6, "from {tick_ms}: {off} ns from the frame");
+        }
+    }
+
+    #[test]
     fn one_stream_or_none_does_not_care() {
         assert_eq!(best_shift(5, 200, 100, &[]), 0);
         assert_eq!(best_shift(5, 200_000_000, 16_000_000, &[at(7, 30.0)]), 0);
