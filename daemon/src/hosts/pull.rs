@@ -167,16 +167,7 @@ impl Pull<'_> {
             }
             copy.write_all(&bytes).map_err(failed)?;
             have += bytes.len() as u64;
-            let is_quick = asked.elapsed() < PIECE_TIME / 2;
-            let is_slow = asked.elapsed() > PIECE_TIME;
-            piece = if is_quick {
-                piece * 2
-            } else if is_slow {
-                piece / 2
-            } else {
-                piece
-            };
-            piece = piece.clamp(PIECE_BYTES, MAX_PART_BYTES);
+            piece = next_piece(piece, asked.elapsed().saturating_sub(turn));
         }
         pulled.copied += have;
         if !is_closed || have < segment.bytes {
