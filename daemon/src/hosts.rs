@@ -138,7 +138,7 @@ impl Hosts {
     /// an earlier daemon did not pull are found again.
     ///
     /// # Errors
-    /// Those of a link to a socket that cannot be made, and of a folder for joining, which is tried now and not at the end of the first recording.
+    /// Those of making a link to a socket, and the folder for joining, which is needed at the end of the first recording.
     pub fn new(
         config: &RigConfig,
         runtime: &RuntimeDir,

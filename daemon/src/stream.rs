@@ -153,7 +153,7 @@ impl Stream {
     }
 }
 
-/// Whether a stream of this name is computed from others.
+/// True for the name of a stream that is computed from others.
 pub fn is_derived(stream: &StreamName) -> bool {
     [REFINED, ALIGNED].contains(&stream.as_str())
 }

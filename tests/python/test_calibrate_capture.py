@@ -228,7 +228,7 @@ def test_a_killed_capture_goes_on_where_it_was(binary: str, runtime: Path, mount
 
 def test_a_recording_gives_the_views_that_it_has(binary: str, runtime: Path, mount: Path, tmp_path: Path) -> None:
     board = str(mount / "board.toml")
-    # A computer that is very busy loses so many frames that the board is hardly seen at rest.
+    # On a very busy computer few frames show the board at rest.
     for seconds in (9, 20, 40):
         recording = mount / "datasets" / f"recording_{seconds}"
         command(binary, runtime, "--rig", "mount", "record", "start", "--name", recording.name)

@@ -87,7 +87,7 @@ def wait_for_sets(recording: depthrig.Recording, more: int) -> None:
 
 
 def wait_until_rendered(binary: str, runtime: Path) -> None:  # noqa: F811
-    """Until the images are no longer sketches. They are rendered below the priority of all else that runs."""
+    """Wait for the rendered images, which come in place of sketches; rendering has the lowest priority."""
     deadline = time.monotonic() + 5 * WAIT_S
     while True:
         asked = [binary, "status", "--json"]

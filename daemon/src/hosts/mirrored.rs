@@ -35,14 +35,14 @@ pub(super) fn cameras(
             why = own.into_iter().find_map(says);
         }
         camera.streams.extend(made(name));
-        if host.state != HostState::Connected {
+        let is_away = host.state != HostState::Connected;
+        if is_away {
             let of_host = host.why.as_deref().unwrap_or("it does not answer");
             why = Some(format!("host {}: {of_host}", host.host));
         }
-        let is_ill_there = !matches!(camera.state, CameraState::Streaming | CameraState::Opening);
-        if let Some(why) = why
-            && (host.state != HostState::Connected || !is_ill_there)
-        {
+        // What is wrong there comes before what is wrong on the way.
+        let is_well_there = matches!(camera.state, CameraState::Streaming | CameraState::Opening);
+        if let Some(why) = why.filter(|_| is_away || is_well_there) {
             camera.message = Some(why);
             if camera.state == CameraState::Streaming {
                 camera.state = CameraState::Stalled;

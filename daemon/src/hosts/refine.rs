@@ -59,7 +59,7 @@ impl HostRefine {
         HostRefineStatus { camera: self.camera.to_string(), refine }
     }
 
-    /// Whether it is the camera of this name.
+    /// True for the camera of this name.
     pub(super) fn is_of(&self, camera: &str) -> bool {
         self.camera.as_str() == camera
     }
