@@ -15,8 +15,8 @@ cargo build --package depthrig # what computes is optimised in this profile too
 scenes() { # NAME ARGUMENT...
     "$program" scenes --out "$data/$1" --per-shard 100 "${@:2}"
 }
-scenes wide --seed 101 --count 3000 --size 448x336 --hide 0.6 --without "$held_out" --camera d435,d405,l515,zed2i,d415
-scenes full --seed 102 --count 700 --size 640x480 --hide 0.6 --without "$held_out" --camera d435,d405,l515,zed2i
+scenes wide --seed 101 --count 5000 --size 448x336 --hide 0.6 --without "$held_out" --camera d435,d405,l515,zed2i,d415
+scenes full --seed 102 --count 1500 --size 640x480 --hide 0.6 --without "$held_out" --camera d435,d405,l515,zed2i
 scenes stereo --seed 103 --count 300 --size 640x480 --hide 0.4 --without "$held_out" --camera d435,d405,zed2i --sensor stereo
 scenes held-out --seed 901 --count 160 --size 640x480 --hide 0.5 --families "$held_out" --camera d435,d405,l515,zed2i
 

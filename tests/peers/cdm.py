@@ -1,12 +1,14 @@
 #!/usr/bin/env python3
 """The network in depthrig's engines beside the official code in PyTorch: time, CPU, memory and agreement, in one run.
 
-usage: cdm.py OFFICIAL WEIGHTS --network PROGRAM [--sizes 252,518] [--rounds 5] [--threads 2] [--engine E]... [--json F]
+usage: cdm.py OFFICIAL WEIGHTS --network PROGRAM [--sizes 252,518] [--rounds 5] [--threads 2] [--torch T]... [--engine E]...
 
 OFFICIAL is a checkout of the folder `cdm` of github.com/ByteDance-Seed/manip-as-in-sim-suite (its code is not part of
-this repository); WEIGHTS a .safetensors file of it, trained or not; PROGRAM the example `network` of depthrig-cdm
-(cargo build --release -p depthrig-cdm --example network). An engine is DEVICE/PRECISION[/LIBRARY]. Needs torch, numpy,
-safetensors, and what the official code imports (opencv, torchvision).
+this repository), or `lab`: the same network in depthrig.lab, with fused attention. WEIGHTS is a file of its state, trained or
+not, .safetensors or of torch.save; PROGRAM the example `network` of depthrig-cdm (cargo build --release -p depthrig-cdm
+--example network). PyTorch runs as DEVICE/PRECISION (cpu/fp32, cpu/bf16, cuda/fp16), of which the first is what the others are
+compared with; an engine is DEVICE/PRECISION[/LIBRARY]. Needs torch, numpy, safetensors, and what the official code imports
+(opencv, torchvision).
 
 The engines alternate: in each round every engine runs once at every size, so that load on the computer affects all. It
 compares CPU time of all threads, best of the rounds, and wall time, best and median.
@@ -19,26 +21,43 @@ SIZES = {"vits": (64, [48, 96, 192, 384]), "vitb": (128, [96, 192, 384, 768]),
 
 
 class Torch:
-    def __init__(self, official, weights, encoder, threads, bf16):
-        sys.path.insert(0, str(official))
+    def __init__(self, official, weights, encoder, threads, way):
         import torch
-        from rgbddepth.dpt import RGBDDepth
         from safetensors.torch import load_file
         torch.set_num_threads(threads)
-        self.torch, self.bf16 = torch, bf16
-        self.name = f"torch {torch.__version__.split('+')[0]} cpu {'bf16' if bf16 else 'fp32'}"
-        features, levels = SIZES[encoder]
-        self.model = RGBDDepth(encoder=encoder, features=features, out_channels=levels).eval()
-        self.model.load_state_dict(load_file(weights), strict=True)
+        # What `fp32` says, as in depthrig.
+        torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = False
+        self.device, precision = way.split("/")
+        self.torch, self.type = torch, {"fp32": None, "bf16": torch.bfloat16, "fp16": torch.float16}[precision]
+        self.name = f"torch {torch.__version__.split('+')[0]} {self.device} {precision}"
+        if str(official) == "lab":
+            from depthrig.lab.nets.cdm import Cdm
+            from depthrig.lab.nets.vit import SIZES as LAB
+            self.model = Cdm(LAB[encoder])
+        else:
+            sys.path.insert(0, str(official))
+            from rgbddepth.dpt import RGBDDepth
+            features, levels = SIZES[encoder]
+            self.model = RGBDDepth(encoder=encoder, features=features, out_channels=levels)
+        state = load_file(weights) if weights.endswith(".safetensors") else torch.load(weights, weights_only=True)
+        self.model.load_state_dict(state, strict=True)
+        self.model.eval().to(self.device)
+        # On a GPU all of it is in 16 bits, as in depthrig; on a CPU not every operator has a kernel for them.
+        self.is_whole = self.type is not None and self.device != "cpu"
+        if self.is_whole:
+            self.model.to(self.type)
 
     def run(self, x):
         torch = self.torch
-        with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=self.bf16):
+        cast = self.type is not None and not self.is_whole
+        with torch.inference_mode(), torch.autocast(self.device, self.type, enabled=cast):
             given = torch.from_numpy(x)
+            if self.device != "cpu":
+                given = given.pin_memory()
             wall, cpu = time.perf_counter(), time.process_time()
-            y = self.model(given)
+            y = self.model(given.to(self.device, self.type if self.is_whole else None)).float().cpu()
             wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-        return y[0].float().numpy(), wall, cpu, None
+        return y[0].numpy(), wall, cpu, None
 
 
 class Ours:
@@ -82,15 +101,15 @@ def main():
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--engine", action="append", default=[])
-    parser.add_argument("--torch-bf16", action="store_true", help="PyTorch with autocast to bf16 as well")
+    parser.add_argument("--torch", action="append", metavar="DEVICE/PRECISION", help="[default: cpu/fp32]")
     parser.add_argument("--json", type=pathlib.Path)
     args = parser.parse_args()
 
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         folder = pathlib.Path(folder)
-        load = lambda bf16: Torch(args.official, args.weights, args.encoder, args.threads, bf16)
-        engines = [load(False), *([load(True)] if args.torch_bf16 else [])]
+        ways = args.torch or ["cpu/fp32"]
+        engines = [Torch(args.official, args.weights, args.encoder, args.threads, way) for way in ways]
         for engine in args.engine or ["cpu/fp32"]:
             engines.append(Ours(args.network, args.weights, engine, args.threads, folder))
         for size in map(int, args.sizes.split(",")):
@@ -111,11 +130,11 @@ def main():
                     "wall_ratio": best(name, 0) / best(reference, 0), "max_abs": float(difference.max()),
                     "mean_relative_percent": float(100 * relative), "peak_mb": peaks[name],
                 })
-    print("| size | engine | CPU s (best) | of torch fp32 | wall s best / median | of torch fp32 | max abs 1/m | mean rel % | peak MB |")
+    print("| size | engine | CPU s (best) | of the first | wall s best / median | of the first | max abs 1/m | mean rel % | peak MB |")
     print("|---|---|---|---|---|---|---|---|---|")
     for r in rows:
-        print(f"| {r['size']} | {r['engine']} | {r['cpu_s']:.2f} | {r['cpu_ratio']:.2f} | {r['wall_s']:.2f} / "
-              f"{r['wall_median_s']:.2f} | {r['wall_ratio']:.2f} | {r['max_abs']:.1e} | {r['mean_relative_percent']:.4f} | "
+        print(f"| {r['size']} | {r['engine']} | {r['cpu_s']:.4f} | {r['cpu_ratio']:.2f} | {r['wall_s']:.4f} / "
+              f"{r['wall_median_s']:.4f} | {r['wall_ratio']:.2f} | {r['max_abs']:.1e} | {r['mean_relative_percent']:.4f} | "
               f"{r['peak_mb'] or '-'} |")
     if args.json:
         args.json.write_text(json.dumps(rows, indent=1))

@@ -35,10 +35,12 @@ const CUDA: [Needed; 9] = [
 ];
 /// Those that TensorRT needs besides.
 const TENSORRT: [Needed; 3] = [
-    needed("libnvinfer.so", "tensorrt-cu13"),
-    needed("libnvinfer_plugin.so", "tensorrt-cu13"),
-    needed("libnvonnxparser.so", "tensorrt-cu13"),
+    needed("libnvinfer.so", NVINFER),
+    needed("libnvinfer_plugin.so", NVINFER),
+    needed("libnvonnxparser.so", NVINFER),
 ];
+/// Later ones have `libnvinfer.so.11`, to which the pinned library is not linked.
+const NVINFER: &str = "'tensorrt-cu13<11'";
 const CUDNN: &str = "nvidia-cudnn-cu13";
 /// The driver's own, which no package on PyPI has.
 const DRIVER: [&str; 2] = ["libcuda.so", "libnvidia-ml.so"];
@@ -111,7 +113,7 @@ pub(super) fn missing(text: &str) -> Option<(String, String)> {
         let package = match known {
             Some(known) => known.package,
             None if name.starts_with("libcudnn") => CUDNN,
-            None if name.starts_with("libnvinfer") => "tensorrt-cu13",
+            None if name.starts_with("libnvinfer") => NVINFER,
             None => return Some((name.to_owned(), GENERAL.to_owned())),
         };
         format!(
@@ -206,8 +208,8 @@ mod tests {
             ("libcudnn_ops.so.9", "nvidia-cudnn-cu13"),
             ("libcufft.so.12", "nvidia-cufft"),
             ("libcurand.so.10", "nvidia-curand"),
-            ("libnvinfer.so.10", "tensorrt-cu13"),
-            ("libnvonnxparser.so.10", "tensorrt-cu13"),
+            ("libnvinfer.so.10", "tensorrt-cu13<11"),
+            ("libnvonnxparser.so.10", "tensorrt-cu13<11"),
         ] {
             // As version 1.31.1 says it on a computer without CUDA.
             let text = format!(

@@ -71,17 +71,18 @@ def example(sample: Sample, config: Config, rng: np.random.Generator) -> Example
     x = int(rng.integers(sample.color.shape[1] - width + 1))
     cut = (slice(y, y + height), slice(x, x + width))
     jitter = config.train.color_jitter
-    color = sample.color[cut].astype(np.float32) / 255
     gamma, gain = np.exp(jitter * rng.uniform(-1, 1)), np.exp(jitter * rng.uniform(-1, 1, 3) / 2)
-    color = np.clip(color**gamma * gain, 0, 1).astype(np.float32)
+    # A table of the 256 values: powers of every pixel took a quarter of the time.
+    levels = (np.arange(256, dtype=np.float32) / 255) ** gamma
+    tables = np.clip(levels * gain[:, None], 0, 1).astype(np.float32)
+    color = np.stack([table[sample.color[(*cut, c)]] for c, table in enumerate(tables)])
     # Of the whole image: a crop has no borders of its own.
     planes: Planes = {"color": color, "raw": raw[cut], "seen": seen_of(raw)[cut]}
     planes["truth"] = np.zeros((height, width), np.float32) if truth is None else truth[cut]
     if config.model.kind == "tiny":
         planes["filled"] = filled_of(sample, planes["raw"], cut)
     if config.train.flip and rng.random() < 0.5:
-        planes = {name: plane[:, ::-1] for name, plane in planes.items()}
-    planes["color"] = planes["color"].transpose(2, 0, 1)
+        planes = {name: plane[..., ::-1] for name, plane in planes.items()}
     return Example(sample.name, {name: np.ascontiguousarray(plane) for name, plane in planes.items()})
 
 

@@ -113,12 +113,15 @@ class LossConfig:
     """Weight of a pixel whose raw depth is missing or wrong by more than 5 %, relative to one that was measured."""
     worse: float = 1.0
     """`fill`: weight of how much worse an image became."""
+    off_m: float = 0.1
+    """`fill`: added to filled depth's error where the change is a part of it, metres. The more, the more do images with large errors count."""
     near_m: float = 0.1
     far_m: float = 6.0
 
     def __post_init__(self) -> None:
         _one_of("space", self.space, ("inverse", "log", "fill"))
         _within("worse", self.worse, 0, 100)
+        _within("off_m", self.off_m, 0.001, 100)
         _within("gradient", self.gradient, 0, 100)
         _within("missing", self.missing, 0.01, 100)
         _within("near_m", self.near_m, 0.01, 100)

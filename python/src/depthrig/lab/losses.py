@@ -13,8 +13,8 @@ __all__ = ["beside_fill_loss", "hole_loss", "refine_loss", "value_loss"]
 WRONG = 0.05
 """Raw depth that is off by more than this share of the truth counts as missing."""
 
-FILL_OFF_M, WORSE_OFF_M = 0.1, 0.01
-"""Added to the L1 of filled depth over an image where it is a denominator."""
+WORSE_OFF_M = 0.01
+"""Added to the L1 of filled depth over an image of which it is a denominator."""
 
 
 def inverse(depth: Tensor) -> Tensor:
@@ -25,7 +25,7 @@ def inverse(depth: Tensor) -> Tensor:
 def beside_fill_loss(predicted: Tensor, truth: Tensor, filled: Tensor, config: LossConfig) -> Tensor:
     """Return the mean over images of what the L1 of depth changes in that of filled depth, as a part of it.
 
-    `FILL_OFF_M` is added to that part's denominator, so that images with much to win count most. An image that became
+    `config.off_m` is added to that part's denominator, so that images with much to win count most. An image that became
     worse counts again, `config.worse` times, as a part of its own error.
 
     :param predicted: `(batch, height, width)`, 1/m, as `filled`.
@@ -40,7 +40,7 @@ def beside_fill_loss(predicted: Tensor, truth: Tensor, filled: Tensor, config: L
     before = error(filled)
     change = error(predicted) - before
     worse = change.clamp_min(0) / (before + WORSE_OFF_M)
-    return (change / (before + FILL_OFF_M) + config.worse * worse).mean()
+    return (change / (before + config.off_m) + config.worse * worse).mean()
 
 
 def refine_loss(predicted: Tensor, truth: Tensor, raw: Tensor, config: LossConfig) -> Tensor:

@@ -10,6 +10,7 @@ use crate::store::{Place, Remote};
 use depthrig_bus::HostTime;
 use depthrig_bus::clock::process_cpu_ns;
 use depthrig_bus::files::replace;
+use depthrig_cdm::Precision;
 use depthrig_cdm::stage::{Installed, RefineModel, Refiners};
 use depthrig_recorder::fs::{Fs, RealFs};
 use depthrig_recorder::{Dataset, Error, ErrorKind, Result, SESSION_FILE};
@@ -237,6 +238,9 @@ struct Run<'a> {
     engine: String,
     model: Option<String>,
     device: &'a str,
+    /// Other than `fp32`, which files of before do not name.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    precision: Option<&'static str>,
     input_size: Option<u32>,
     is_aligned: bool,
     fill_reach: f64,
@@ -258,6 +262,7 @@ impl Work<'_> {
                 }
             }),
             device: &refine.device,
+            precision: (refine.precision != Precision::Fp32).then_some(refine.precision.name()),
             input_size: refine.input_size,
             is_aligned: refine.is_aligned,
             fill_reach: refine.fill_reach,

@@ -9,10 +9,10 @@ use crate::scratch::Scratch;
 use crate::watched::{DerivedDataset, watched};
 use anyhow::Result;
 use clap::ValueEnum;
-use depthrig_cdm::FillRefiner;
 use depthrig_cdm::stage::{CdmConfig, EngineChoice, RefineConfig, RefineModel};
 use depthrig_cdm::store::names_a_file;
 use depthrig_cdm::tiny::is_tiny_file;
+use depthrig_cdm::{FillRefiner, Precision};
 use depthrig_convert::RunPart;
 use depthrig_convert::relabel::{RelabelOptions, RelabelReport, relabel};
 use depthrig_convert::store::Place;
@@ -75,6 +75,9 @@ pub struct RelabelArgs {
     /// Device that runs the network: cpu, cuda:0, tensorrt:0 or openvino
     #[arg(long, default_value = "cpu")]
     device: String,
+    /// Precision of the network: fp32, fp16 or bf16
+    #[arg(long, value_name = "PRECISION", default_value = "fp32", value_parser = super::run::precision)]
+    precision: Precision,
     /// ONNX Runtime library [default: found automatically]
     #[arg(long, value_name = "FILE")]
     library: Option<PathBuf>,
@@ -122,6 +125,7 @@ impl RelabelArgs {
             model,
             input_size: self.input_size,
             device: self.device.clone(),
+            precision: self.precision,
             is_aligned: self.is_aligned,
             fill_reach: self.fill_reach,
             ..RefineConfig::default()

@@ -12,6 +12,8 @@ from .vit import PATCH, Encoder, Size
 __all__ = ["MEAN", "STD", "Cdm", "normalise_color"]
 
 FUSION_HEADS = 4
+START = 0.5
+"""Inverse depth that an untrained network gives about everywhere, 1/m."""
 MEAN = (0.485, 0.456, 0.406)
 STD = (0.229, 0.224, 0.225)
 
@@ -37,6 +39,10 @@ class Cdm(nn.Module):
         self.crossAtts = nn.ModuleList(
             nn.MultiheadAttention(size.width, FUSION_HEADS, batch_first=True) for _ in range(4)
         )
+        # Without weights to begin with: what is negative everywhere is 0 after the last activation, and never learns.
+        last = self.depth_head_rgbd.scratch.output_conv2[-1]
+        assert isinstance(last, nn.Conv2d) and last.bias is not None
+        nn.init.constant_(last.bias, START)
 
     def forward(self, x: Tensor) -> Tensor:
         """Return `(batch, height, width)`.

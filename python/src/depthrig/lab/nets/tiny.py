@@ -78,9 +78,10 @@ class Tiny(nn.Module):
     :param width: channels at an eighth of the resolution; a multiple of 8.
     """
 
-    def __init__(self, width: int = 48):
+    def __init__(self, width: int = 80):
         super().__init__()
-        widths = (width, 2 * width)
+        # In eights, which a group of the norms has.
+        widths = (width, max(width, 3 * width // 16 * 8))
         guesses = len(GUESSES)
         self.apart = nn.Conv2d(CHANNELS + 1, widths[0], CELL, CELL)
         self.hint = nn.Conv2d(guesses * (1 + FEATURES), widths[0], 1)
