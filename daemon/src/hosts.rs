@@ -8,6 +8,7 @@
 //! session  the recordings with parts elsewhere, and a file beside each that says so
 //! visit    what one look at a host's status leads to, and pulling beside it
 //! mirrored its cameras, as they are seen here
+//! reach    the way to its daemon
 //! pull     segments by ranges of bytes, resumed where they ended, compared at the end
 //! ```
 //!
@@ -17,6 +18,7 @@
 
 mod mirrored;
 mod pull;
+pub(crate) mod reach;
 mod refine;
 mod session;
 #[cfg(test)]
@@ -24,7 +26,7 @@ mod tests;
 mod visit;
 
 use crate::client::Client;
-use crate::config::{HostConfig, Reach, RigConfig};
+use crate::config::{HostConfig, RigConfig};
 use crate::control::{FollowRequest, RecordRequest};
 use crate::mirror::Mirror;
 use crate::recording::reserve_bytes;
@@ -37,7 +39,7 @@ use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::sync::lock;
 use depthrig_bus::{HostTime, RigName, RuntimeDir};
-use depthrig_link::{Key, Remote, Tunnel};
+use depthrig_link::{Key, Tunnel};
 use depthrig_recorder::fs::RealFs;
 use depthrig_recorder::{Health, SESSION_FILE, look_at};
 use refine::HostRefine;
@@ -149,14 +151,7 @@ impl Hosts {
         let Some(link) = config.link.as_ref().filter(|link| !link.hosts.is_empty()) else { return Ok(None) };
         RuntimeDir::at(&runtime.path().join(JOINING))?;
         for host in &link.hosts {
-            let here = runtime.host_socket_path(&config.rig, &host.name);
-            let _ = std::fs::remove_file(&here);
-            if let Reach::Socket(path) = &host.reach {
-                std::os::unix::fs::symlink(path, &here).map_err(|e| {
-                    let what = format!("host {}: {} cannot be made: {e}", host.name, here.display());
-                    Error::new(ErrorKind::Other, what).with_source(e)
-                })?;
-            }
+            reach::link_socket(host, &config.rig, runtime)?;
         }
         let seen = |host: &HostConfig| HostStatus {
             host: host.name.to_string(),
@@ -251,7 +246,7 @@ impl Hosts {
     ) -> Result<()> {
         let Some(host) = self.others.get(number) else { return Ok(()) };
         let client = Client::of_host(&self.runtime, &self.rig, &host.config.name)?;
-        let tunnel = self.tunnel(host)?;
+        let tunnel = reach::tunnel(&host.config, &self.rig, &self.runtime)?;
         let mut connected_since = None;
         let mut may_begin = true;
         while !stop.load(Ordering::Relaxed) {
@@ -330,20 +325,6 @@ impl Hosts {
         }
     }
 
-    fn tunnel(&self, host: &Host) -> Result<Option<Tunnel>> {
-        let Reach::Ssh { destination, socket } = &host.config.reach else { return Ok(None) };
-        let here = self.runtime.host_socket_path(&self.rig, &host.config.name);
-        let remote = match socket {
-            Some(path) => Remote::Path(path.clone()),
-            None => Remote::InRuntimeDir(format!("{}.sock", self.rig)),
-        };
-        let tunnel = Tunnel::start(destination, &here, remote).map_err(|e| {
-            Error::new(ErrorKind::Other, format!("no thread for host {}: {e}", host.config.name))
-                .with_source(e)
-        })?;
-        Ok(Some(tunnel))
-    }
-
     /// Writes down what a look at a host found; whether that is news.
     fn note(&self, host: &Host, looked: Result<&RigStatus, &Error>, tunnel: Option<&Tunnel>) -> bool {
         let name = &host.config.name;
@@ -386,33 +367,9 @@ impl Hosts {
     /// The reason to refuse a daemon that answers as this host; `None` without one.
     fn refusal(&self, host: &Host, status: &RigStatus) -> Option<String> {
         let name = &host.config.name;
-        if status.rig != self.rig.as_str() {
-            return Some(format!(
-                "its rig is \"{}\"; write rig = \"{}\" into its rig file",
-                status.rig, self.rig
-            ));
-        }
-        let Some(link) = &status.link else {
-            return Some(
-                "its rig file has no [link], so that its clock is unknown; write the table there".to_owned(),
-            );
-        };
-        if link.host != name.as_str() {
-            return Some(format!(
-                "its name is \"{}\"; write host = \"{name}\" into [link] of its rig file",
-                link.host
-            ));
-        }
-        if link.recorder.is_none() {
-            return Some(
-                "its rig file has listen in [link]; a session has one computer with listen".to_owned(),
-            );
-        }
-        if link.insecure != self.key.is_none() {
-            return Some(
-                "only one of both has insecure = true in [link]; write it into both rig files, or into neither"
-                    .to_owned(),
-            );
+        let misfit = reach::misfit(&self.rig, name, self.key.is_none(), status);
+        if misfit.is_some() {
+            return misfit;
         }
         let twice = |is_taken: &dyn Fn(&String) -> bool| {
             status.cameras.iter().map(|camera| &camera.name).find(|name| is_taken(name)).cloned()
@@ -426,8 +383,8 @@ impl Hosts {
                 Some((name, format!("host {}", o.config.name)))
             })
         });
-        let (camera, where_) = shared?;
-        Some(format!("camera \"{camera}\" is a name on {where_}, too; give one of them another name"))
+        let (camera, place) = shared?;
+        Some(reach::taken(&camera, &place))
     }
 
     /// Joins the parts of recordings as they become complete, until `stop`.

@@ -7,6 +7,8 @@ use std::process::Child;
 
 /// Bytes each way: a tenth of a second at 0.4 Gbit/s, twenty seconds on the slowest Wi-Fi.
 const BYTES: u64 = 5_000_000;
+/// Lines there and back, of which the quickest is the round trip.
+const LINES: usize = 5;
 /// Bytes of one write or read.
 const AT_ONCE: usize = 64 << 10;
 
@@ -17,6 +19,8 @@ pub struct Rates {
     pub from_there: f64,
     /// Bytes a second to there.
     pub to_there: f64,
+    /// A line there and back, through `ssh` and a shell, microseconds.
+    pub round_trip_us: f64,
 }
 
 /// Moves 5 MB each way between this computer and `destination`, as [`crate::Tunnel`] names it.
@@ -24,25 +28,45 @@ pub struct Rates {
 /// # Errors
 /// The last line that `ssh` printed, when it does not come there.
 pub fn measure(destination: &str) -> Result<Rates, String> {
-    let mut child = spawn(destination, &[], &format!("head -c {BYTES} /dev/zero; cat >/dev/null"))?;
+    // Bytes that an `ssh` which compresses cannot make fewer.
+    let there = format!(
+        "sh -c 'n=0; while [ $n -lt {LINES} ]; do read line; echo; n=$((n+1)); done; head -c {BYTES} /dev/urandom; cat >/dev/null'"
+    );
+    let mut child = spawn(destination, &[], &there)?;
     let measured = both(&mut child);
     // It ends with its input.
     drop(child.stdin.take());
     let status = child.wait();
     match measured {
-        Ok((begun, received, sent)) if status.is_ok_and(|status| status.success()) => {
+        Ok(Times { round_trip_us, begun, received }) if status.is_ok_and(|status| status.success()) => {
             let rate = |from: HostTime, to: HostTime| BYTES as f64 * 1e9 / to.since_ns(from).max(1) as f64;
             let ended = HostTime::now();
-            Ok(Rates { from_there: rate(begun, received), to_there: rate(sent, ended) })
+            Ok(Rates { from_there: rate(begun, received), to_there: rate(received, ended), round_trip_us })
         }
         _ => Err(said(destination, &text(child.stderr.as_mut()))),
     }
 }
 
-/// When the first byte came, when the last one did, and when sending began.
-fn both(child: &mut Child) -> io::Result<(HostTime, HostTime, HostTime)> {
+/// What was seen until the last byte was sent.
+struct Times {
+    round_trip_us: f64,
+    /// When the first byte came.
+    begun: HostTime,
+    /// When the last one had come; then sending began.
+    received: HostTime,
+}
+
+fn both(child: &mut Child) -> io::Result<Times> {
     let closed = || io::Error::from(io::ErrorKind::BrokenPipe);
     let stdout = child.stdout.as_mut().ok_or_else(closed)?;
+    let mut stdin = child.stdin.take().ok_or_else(closed)?;
+    let mut round_trip_us = f64::INFINITY;
+    for _ in 0..LINES {
+        let sent = HostTime::now();
+        stdin.write_all(b"\n")?;
+        stdout.read_exact(&mut [0])?;
+        round_trip_us = round_trip_us.min(HostTime::now().since_ns(sent) as f64 / 1e3);
+    }
     let mut buffer = vec![0; AT_ONCE];
     let mut begun = None;
     let mut received = 0;
@@ -55,12 +79,11 @@ fn both(child: &mut Child) -> io::Result<(HostTime, HostTime, HostTime)> {
         received += n;
     }
     let all = HostTime::now();
-    let mut stdin = child.stdin.take().ok_or_else(closed)?;
     let mut left = BYTES as usize;
     while left > 0 {
         let n = left.min(AT_ONCE);
         stdin.write_all(&buffer[..n])?;
         left -= n;
     }
-    Ok((begun.unwrap_or(all), all, all))
+    Ok(Times { round_trip_us, begun: begun.unwrap_or(all), received: all })
 }

@@ -80,10 +80,10 @@ class Rig:
             DEPTHRIG_RUNTIME_DIR=str(self.runtime[host]),
             DEPTHRIG_TEST_DATA=str(DATA),
         )
-        if host == "there":
+        if host == "there" and "here" in self.daemons:
             self.wait_for_host("connected")
         else:
-            wait_for("the daemon here", lambda: self.ask("status", codes=(0, 1, 3)))
+            wait_for(f"the daemon {host}", lambda: self.ask("status", host=host, codes=(0, 1, 3)))
 
     def kill(self, host: str) -> None:
         self.daemons[host].send_signal(signal.SIGKILL)
@@ -217,10 +217,17 @@ def test_doctor_measures_the_way_before_a_session(rig: Rig) -> None:
 
     # The server may still be starting.
     way = wait_for("a way", lambda: found().get("host_reached"))
-    rates = re.fullmatch(r"host left: (\d+) MB/s from there, (\d+) MB/s to there", str(way))
+    numbers = re.fullmatch(r"host left: (\d+) MB/s from there, (\d+) MB/s to there, round trip (\d+\.\d) ms", str(way))
     # The wire has 1 Gbit/s, 125 MB/s; bytes that the kernels hold are counted as sent.
-    assert rates, way
-    assert all(8 < int(rate) <= 300 for rate in rates.groups()), way
+    assert numbers, way
+    assert all(8 < int(rate) <= 300 for rate in numbers.groups()[:2]), way
+    assert float(numbers[3]) < 100, way
+    assert "host left: its daemon does not answer: " in found()["host_silent"]
+    # Nobody is asked to stop for it.
+    rig.start("there")
+    wait_for("an answer from there", lambda: "host_silent" not in found())
+    assert "host_refused" not in found()
+    assert not list(rig.runtime["here"].glob("*@left*")), "nothing stays of the way to its socket"
     rig.hosts.cut()
     assert "host left is not reached: ssh left: " in found()["host_unreachable"]
 

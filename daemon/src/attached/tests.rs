@@ -114,24 +114,7 @@ pub(crate) fn rig_with(port: &str) -> RigStatus {
         mount: None,
         streams: Vec::new(),
     };
-    RigStatus {
-        rig: "mount".into(),
-        version: String::new(),
-        pid: 77,
-        uptime_s: 1.0,
-        utc_ns: 0,
-        preparing: None,
-        cameras: vec![camera],
-        sets: crate::status::SetStatus::default(),
-        recording: None,
-        shared_memory: crate::status::SharedMemoryStatus::default(),
-        cpu_cores: 0.0,
-        replay: None,
-        signals: Vec::new(),
-        link: None,
-        hosts: None,
-        ros2: None,
-    }
+    RigStatus { rig: "mount".into(), pid: 77, uptime_s: 1.0, cameras: vec![camera], ..RigStatus::default() }
 }
 
 fn look_at(devices: &[FakeDevice], fake: &FakeAnswers, more: impl FnOnce(&FakeTree)) -> Attached {

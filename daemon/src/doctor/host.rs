@@ -53,7 +53,7 @@ impl Host {
         let rig_holder = around.runtime.as_ref().and_then(|r| r.holder(&config.rig));
         // The rig that runs has the address.
         let link = config.link.as_ref().filter(|_| rig_holder.is_none());
-        let ways = link.map(ways::measure).unwrap_or_default();
+        let ways = link.map(|link| ways::measure(config, link, around.runtime.as_ref())).unwrap_or_default();
         let link = link.map(link::ask);
         Self {
             root: around.root.clone(),
@@ -102,7 +102,7 @@ impl Host {
         if let Some(link) = &self.link {
             link::check(link, findings);
         }
-        ways::check(&self.ways, findings);
+        ways::check(config, &self.ways, findings);
         if let Some(ppm) = self.clock.map(|c| c.slew_ppm).filter(|ppm| ppm.abs() > MAX_SLEW_PPM) {
             findings.push(Finding::new(
                 Severity::Warning,

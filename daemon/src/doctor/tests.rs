@@ -4,7 +4,6 @@
 
 use super::cameras;
 use super::plan::Planned;
-use super::ways::Way;
 use super::*;
 use crate::attached::look;
 use crate::attached::tests::{FakeAnswers, kinect_half, profile, rig_with};
@@ -12,11 +11,11 @@ use crate::attached::{Attached, UseState};
 use crate::family::{Selector, Unmet, kinect};
 use depthrig_bus::PixelFormat;
 use depthrig_driver::ErrorKind;
-use depthrig_link::rates::Rates;
 use depthrig_usb::fake::{FakeDevice, FakeTree};
 use std::path::PathBuf;
 
 mod external;
+mod ways;
 
 const FILES: &str = r#"
 rig = "mount"
@@ -122,24 +121,6 @@ fn every_fault_of_the_computer_has_its_finding() {
             assert!(!f.what.is_empty() && !f.why.is_empty() && !f.cure.is_empty(), "{f:?}");
         }
     }
-}
-
-#[test]
-fn ways_to_other_computers_are_judged_by_their_rate() {
-    let found = |rates| {
-        let way = Way { host: "left".parse().unwrap(), destination: "lab@left".into(), rates };
-        let report = host_report(FILES, |h| h.ways = vec![way]);
-        (ids(&report), all_text(&report.findings))
-    };
-    let mb_s =
-        |from_there: f64, to_there: f64| Ok(Rates { from_there: from_there * 1e6, to_there: to_there * 1e6 });
-    assert_eq!(found(mb_s(112.0, 110.0)).0, [("host_reached", Severity::Info)]);
-    let (slow, text) = found(mb_s(2.4, 110.0));
-    assert_eq!(slow, [("host_slow", Severity::Warning)]);
-    assert!(text.contains("host left: 2 MB/s from there, 110 MB/s to there"), "{text}");
-    let (away, text) = found(Err("ssh lab@left: Permission denied (publickey).".into()));
-    assert_eq!(away, [("host_unreachable", Severity::Error)]);
-    assert!(text.contains("Permission denied") && text.contains("ssh-copy-id lab@left"), "{text}");
 }
 
 #[test]
