@@ -7,6 +7,7 @@ use crate::{
     Weights,
 };
 use device::Device;
+use kept::Kept;
 use ort::memory::{AllocationDevice, Allocator, AllocatorType, MemoryInfo, MemoryType};
 use ort::session::{IoBinding, Session};
 use ort::value::Tensor;
@@ -16,6 +17,7 @@ use std::sync::Arc;
 use weights::BoundWeights;
 
 pub mod device;
+mod kept;
 mod library;
 mod nvidia;
 mod providers;
@@ -60,8 +62,9 @@ pub fn find_library(wanted: Option<&Path>, device: &str, precision: Precision) -
 pub struct OnnxNetwork {
     description: String,
     device: Device,
-    /// Of the size that was prepared last.
-    bound: Option<Bound>,
+    bound: Kept<NetShape, Bound>,
+    /// Whether the last of them is what was prepared last.
+    is_prepared: bool,
     session: Session,
     /// After the session, which reads them.
     _weights: BoundWeights,
@@ -70,7 +73,6 @@ pub struct OnnxNetwork {
 /// Input and output at one size.
 #[derive(Debug)]
 struct Bound {
-    shape: NetShape,
     x: Tensor<f32>,
     binding: IoBinding,
 }
@@ -101,7 +103,7 @@ impl OnnxNetwork {
         let threads = options.thread_count();
         let session = session::open(&runtime, &graph, (&weights, id), &device, options.precision, threads)?;
         let description = describe(&runtime.version, &device, options.precision);
-        Ok(Self { description, device, bound: None, session, _weights: weights })
+        Ok(Self { description, device, bound: Kept::new(), is_prepared: false, session, _weights: weights })
     }
 
     fn bind(&mut self, shape: NetShape, positions: &PositionEmbeddings) -> ort::Result<Bound> {
@@ -127,7 +129,7 @@ impl OnnxNetwork {
         }
         binding.bind_input("x", &x)?;
         binding.bind_output("y", y)?;
-        Ok(Bound { shape, x, binding })
+        Ok(Bound { x, binding })
     }
 }
 
@@ -151,7 +153,7 @@ impl Network for OnnxNetwork {
     }
 
     fn prepare(&mut self, shape: NetShape, positions: &PositionEmbeddings) -> Result<()> {
-        self.bound = None;
+        self.is_prepared = false;
         let patches =
             shape.height.is_multiple_of(crate::arch::PATCH) && shape.width.is_multiple_of(crate::arch::PATCH);
         let tokens = 1 + shape.patches();
@@ -167,16 +169,21 @@ impl Network for OnnxNetwork {
             );
             return Err(Error::new(ErrorKind::BadInput, message));
         }
-        let bound = self.bind(shape, positions).map_err(|e| failed(&self.description, "making room", &e))?;
-        self.bound = Some(bound);
+        // The position embeddings of a size are always the same, and stay on the device.
+        if !self.bound.turn_to(&shape) {
+            let bound =
+                self.bind(shape, positions).map_err(|e| failed(&self.description, "making room", &e))?;
+            self.bound.push(shape, bound);
+        }
+        self.is_prepared = true;
         Ok(())
     }
 
     fn run(&mut self, x: &[f32], y: &mut [f32]) -> Result<()> {
-        let Self { description, device, bound, session, .. } = self;
+        let Self { description, device, bound, is_prepared, session, .. } = self;
         let not_prepared =
             |what: String| Err(Error::new(ErrorKind::BadInput, format!("{description}: {what}")));
-        let Some(Bound { shape, x: input, binding }) = bound else {
+        let Some((shape, Bound { x: input, binding })) = bound.last_mut().filter(|_| *is_prepared) else {
             return not_prepared("run before it was prepared for a size".into());
         };
         if x.len() != shape.input_len() || y.len() != shape.output_len() {

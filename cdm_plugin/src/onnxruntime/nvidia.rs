@@ -208,8 +208,8 @@ mod tests {
             ("libcudnn_ops.so.9", "nvidia-cudnn-cu13"),
             ("libcufft.so.12", "nvidia-cufft"),
             ("libcurand.so.10", "nvidia-curand"),
-            ("libnvinfer.so.10", "tensorrt-cu13<11"),
-            ("libnvonnxparser.so.10", "tensorrt-cu13<11"),
+            ("libnvinfer.so.10", "'tensorrt-cu13<11'"),
+            ("libnvonnxparser.so.10", "'tensorrt-cu13<11'"),
         ] {
             // As version 1.31.1 says it on a computer without CUDA.
             let text = format!(

@@ -113,6 +113,10 @@ fn start(path: PathBuf, version: String) -> Result<Runtime> {
 /// Logs the library's messages one level lower than it does: important ones also come back as an error.
 fn log(level: LogLevel, _category: &str, _id: &str, _place: &str, message: &str) {
     match level {
+        // cuDNN, of each way to compute a convolution that it tries and lacks: two dozen lines for `vitl`, which runs.
+        LogLevel::Error if message.starts_with("[cudnn_frontend]") => {
+            tracing::debug!(target: "onnxruntime", "{message}");
+        }
         LogLevel::Error | LogLevel::Fatal => tracing::warn!(target: "onnxruntime", "{message}"),
         LogLevel::Warning => tracing::debug!(target: "onnxruntime", "{message}"),
         _ => tracing::trace!(target: "onnxruntime", "{message}"),

@@ -3,6 +3,7 @@
 #![allow(unsafe_code)]
 
 use super::device::Device;
+use super::kept::Kept;
 use super::runtime::Runtime;
 use super::{describe_as, failed, session};
 use crate::network::ImageNetwork;
@@ -12,8 +13,6 @@ use ort::memory::Allocator;
 use ort::session::{IoBinding, Session};
 use ort::value::Tensor;
 
-/// Sizes that are kept; the oldest goes. More than a rig has.
-const SIZES: usize = 8;
 /// Planes of the input.
 const PLANES: usize = 6;
 
@@ -21,16 +20,14 @@ const PLANES: usize = 6;
 #[derive(Debug)]
 pub struct TinyNetwork {
     description: String,
-    /// The size in use last.
-    bound: Vec<Bound>,
+    /// By width and height.
+    bound: Kept<(usize, usize), Bound>,
     session: Session,
 }
 
 /// Input and output of one size.
 #[derive(Debug)]
 struct Bound {
-    width: usize,
-    height: usize,
     x: Tensor<f32>,
     filled: Tensor<f32>,
     refined: Tensor<f32>,
@@ -56,7 +53,7 @@ impl TinyNetwork {
         let runtime = Runtime::get(options.library.as_deref(), &device)?;
         let description = describe_as("tiny onnxruntime", &runtime.version, &device, options.precision);
         let session = session::open_bytes(&runtime, bytes, &description, options.thread_count())?;
-        Ok(Self { description, bound: Vec::new(), session })
+        Ok(Self { description, bound: Kept::new(), session })
     }
 
     /// The engine with version, device and precision, such as `tiny onnxruntime 1.31 cpu fp32`; at most 31 bytes.
@@ -73,23 +70,17 @@ impl TinyNetwork {
         binding.bind_input("x", &x)?;
         binding.bind_input("filled", &filled)?;
         binding.bind_output("refined", &mut refined)?;
-        Ok(Bound { width, height, x, filled, refined, binding })
+        Ok(Bound { x, filled, refined, binding })
     }
 }
 
 impl ImageNetwork for TinyNetwork {
     fn inputs(&mut self, width: usize, height: usize) -> Result<(&mut [f32], &mut [f32])> {
-        if let Some(at) = self.bound.iter().position(|b| (b.width, b.height) == (width, height)) {
-            // To the end, where the last one is; within the list's own memory.
-            self.bound[at..].rotate_left(1);
-        } else {
+        if !self.bound.turn_to(&(width, height)) {
             let bound = self.bind(width, height).map_err(|e| failed(&self.description, "making room", &e))?;
-            if self.bound.len() == SIZES {
-                self.bound.remove(0);
-            }
-            self.bound.push(bound);
+            self.bound.push((width, height), bound);
         }
-        let bound = self.bound.last_mut().ok_or_else(|| not_bound(&self.description))?;
+        let (_, bound) = self.bound.last_mut().ok_or_else(|| not_bound(&self.description))?;
         Ok((bound.x.extract_tensor_mut().1, bound.filled.extract_tensor_mut().1))
     }
 

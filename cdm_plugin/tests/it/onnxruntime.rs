@@ -147,6 +147,37 @@ fn what_does_not_fit_is_refused_and_the_network_goes_on() {
     assert!(y.iter().all(|d| d.is_finite()));
 }
 
+/// A size that was prepared before is bound already.
+#[test]
+fn sizes_and_batches_take_turns() {
+    let model = seeded_model(Encoder::Vits);
+    let Some(mut network) = open(&model) else { return };
+    let positions = Positions::read(&model.encoder.architecture(), &model.weights).unwrap();
+    let shapes = [(1, 28, 28), (2, 28, 28), (1, 28, 42)].map(|(batch, height, width)| NetShape {
+        batch,
+        height,
+        width,
+    });
+    let run = |network: &mut OnnxNetwork, shape: NetShape| {
+        let mut y = vec![f32::NAN; shape.output_len()];
+        network.prepare(shape, &positions.at(shape)).unwrap();
+        network.run(&image(shape, 4), &mut y).unwrap();
+        y
+    };
+    let alone = shapes.map(|shape| run(&mut open(&model).unwrap(), shape));
+    for _ in 0..2 {
+        for (shape, alone) in shapes.iter().zip(&alone) {
+            assert!(run(&mut network, *shape) == *alone, "{shape:?}");
+        }
+    }
+    // What failed to be prepared is not run as what was before.
+    let wrong = NetShape { height: 29, ..shapes[0] };
+    network.prepare(wrong, &positions.at(shapes[0])).unwrap_err();
+    let mut y = vec![0.0; shapes[2].output_len()];
+    let error = network.run(&image(shapes[2], 4), &mut y).unwrap_err();
+    assert_eq!(error.kind(), ErrorKind::BadInput, "{error}");
+}
+
 #[test]
 fn what_the_library_has_not_is_said() {
     let model = seeded_model(Encoder::Vits);

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -134,6 +135,10 @@ def loader(batches: Batches, first_step: int) -> Any:
     steps = range(first_step, batches.config.train.steps)
     # A generator of its own, so that reading does not touch the one of the network.
     own = torch.Generator().manual_seed(batches.config.seed)
-    # Not by fork: this process has threads.
-    options: dict[str, Any] = {"prefetch_factor": 2, "multiprocessing_context": "forkserver"} if workers else {}
+    options: dict[str, Any] = {}
+    if workers:
+        # Not by fork: this process has threads. What all import is imported once: they start one after the other.
+        context = multiprocessing.get_context("forkserver")
+        context.set_forkserver_preload([__name__])
+        options = {"prefetch_factor": 2, "multiprocessing_context": context}
     return DataLoader(batches, batch_size=None, sampler=steps, num_workers=workers, generator=own, **options)
