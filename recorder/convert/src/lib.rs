@@ -22,6 +22,7 @@ mod hdf5;
 mod import;
 pub mod kinect;
 pub mod lerobot;
+mod part_file;
 pub mod recalibrate;
 pub mod relabel;
 mod report;
@@ -40,6 +41,7 @@ pub use export::{ExportOptions, ExportProgress, Exporter, PartOut, PartSets, Par
 pub use folder::{OutFile, Output};
 pub use hdf5::Hdf5;
 pub use import::{ImportFacts, ImportProgress, ImportReport, Importer, import};
+pub use part_file::open_part;
 pub use report::{DatasetIdentity, ExportReport, PartRecord, REPORT_FILE, SegmentIdentity, StreamCount};
 pub use rosbag::RosbagImport;
 pub use rows::{Incomplete, RowOptions};

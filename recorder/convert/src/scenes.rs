@@ -12,9 +12,8 @@ use depthrig_bus::clock::process_cpu_ns;
 use depthrig_recorder::{Error, ErrorKind, Result};
 use depthrig_sim::synthetic::scenes::{Generator, Sensor, TriangleMesh, Triplet};
 use serde::Serialize;
-use std::fs::{File, OpenOptions, TryLockError};
+use std::fs::File;
 use std::io::{self, BufWriter};
-use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
 mod dataset;
@@ -327,38 +326,24 @@ struct Part {
     path: Option<PathBuf>,
 }
 
-/// Whether `path` is the name of this file.
-fn is_named(file: &File, path: &Path) -> bool {
-    let both = file.metadata().and_then(|open| Ok((open, path.metadata()?)));
-    both.is_ok_and(|(open, named)| (open.dev(), open.ino()) == (named.dev(), named.ino()))
-}
-
 impl Part {
     fn create(shard: &Path) -> Result<Self> {
         let mut name = shard.as_os_str().to_owned();
         name.push(".part");
         let path = PathBuf::from(name);
-        loop {
-            // One that a killed run left is written anew.
-            let options = OpenOptions::new().write(true).create(true).truncate(false).open(&path);
-            let file = options.map_err(|e| Error::io("create", &path, e))?;
-            match file.try_lock() {
-                Err(TryLockError::WouldBlock) => {
-                    let what = format!(
-                        "{}: another process makes this shard; give each its own --shard",
-                        path.display()
-                    );
-                    return Err(Error::new(ErrorKind::InUse, what));
-                }
-                // Some network file systems have no locks.
-                Err(TryLockError::Error(_)) | Ok(()) => {}
+        let file = crate::open_part(&path).map_err(|e| match e.kind() {
+            io::ErrorKind::WouldBlock => {
+                let what = format!(
+                    "{}: another process makes this shard; give each its own --shard",
+                    path.display()
+                );
+                Error::new(ErrorKind::InUse, what)
             }
-            // Between opening and locking another process may have completed it: then this is the shard itself.
-            if is_named(&file, &path) {
-                file.set_len(0).map_err(|e| Error::io("write", &path, e))?;
-                return Ok(Self { file, path: Some(path) });
-            }
-        }
+            _ => Error::io("create", &path, e),
+        })?;
+        // One that a killed run left is written anew.
+        file.set_len(0).map_err(|e| Error::io("write", &path, e))?;
+        Ok(Self { file, path: Some(path) })
     }
 
     fn rename(mut self, to: &Path) -> io::Result<()> {

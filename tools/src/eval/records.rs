@@ -9,11 +9,11 @@ use super::refine::RowInfo;
 use anyhow::{Context, Result, bail};
 use depthrig_bus::files::sync_folder_of;
 use depthrig_cdm::metrics::{DepthRange, Measured, Rules};
-use depthrig_convert::RunPart;
+use depthrig_convert::{RunPart, open_part};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-use std::fs::{File, OpenOptions, TryLockError};
-use std::io::{BufRead, BufReader, BufWriter, Seek, SeekFrom, Write};
+use std::fs::File;
+use std::io::{BufRead, BufReader, BufWriter, ErrorKind, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 /// Version of the layout.
@@ -230,20 +230,11 @@ impl Writer {
         name.push(".part");
         let part = PathBuf::from(name);
         let cannot = || format!("{}: cannot be written", part.display());
-        let file = OpenOptions::new()
-            .read(true)
-            .write(true)
-            .create(true)
-            .truncate(false)
-            .open(&part)
-            .with_context(cannot)?;
-        match file.try_lock() {
-            Err(TryLockError::WouldBlock) => {
-                bail!("{}: another process writes it; give each its own --shard and --sums", part.display())
-            }
-            // Some network file systems have no locks.
-            Err(TryLockError::Error(_)) | Ok(()) => {}
+        let opened = open_part(&part);
+        if opened.as_ref().is_err_and(|e| e.kind() == ErrorKind::WouldBlock) {
+            bail!("{}: another process writes it; give each its own --shard and --sums", part.display())
         }
+        let file = opened.with_context(cannot)?;
         let mut good = 0;
         let mut bytes = BufReader::new(&file);
         let mut first = String::new();

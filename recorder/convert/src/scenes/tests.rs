@@ -1,6 +1,7 @@
 use super::*;
 use depthrig_sim::synthetic::scenes::{Settings, TRUTH_UNIT_M};
 use std::collections::BTreeMap;
+use std::fs::OpenOptions;
 
 fn generator() -> Generator {
     Generator::new(Settings { seed: 3, width: 64, height: 48, ..Settings::default() }).unwrap()
@@ -163,20 +164,6 @@ fn another_run_another_process_and_impossible_plans_are_refused() {
     for bad in [Plan { name: "../t".into(), ..plan(dir.path()) }, Plan { per_shard: 0, ..plan(dir.path()) }] {
         assert_eq!(refused(&bad).kind(), ErrorKind::BadInput);
     }
-}
-
-#[test]
-fn a_part_that_became_a_shard_is_not_the_part_any_more() {
-    let dir = tempfile::tempdir().unwrap();
-    let shard = dir.path().join("t-000000.tar");
-    let part = Part::create(&shard).unwrap();
-    let name = part.path.clone().unwrap();
-    let opened = File::open(&name).unwrap();
-    assert!(is_named(&opened, &name));
-    part.rename(&shard).unwrap();
-    assert!(!is_named(&opened, &name), "it has another name");
-    std::fs::write(&name, "of another process").unwrap();
-    assert!(!is_named(&opened, &name) && is_named(&opened, &shard));
 }
 
 #[test]
