@@ -5,8 +5,9 @@ use depthrig_bus::HostTime;
 use std::io::{self, Read, Write};
 use std::process::Child;
 
-/// Bytes each way: a tenth of a second at 0.4 Gbit/s, twenty seconds on the slowest Wi-Fi.
-const BYTES: u64 = 5_000_000;
+/// Bytes each way, in so many blocks: a tenth of a second at 0.4 Gbit/s, twenty seconds on the slowest Wi-Fi.
+const BYTES: u64 = BLOCKS * AT_ONCE as u64;
+const BLOCKS: u64 = 77;
 /// Lines there and back, of which the quickest is the round trip.
 const LINES: usize = 5;
 /// Bytes of one write or read.
@@ -29,7 +30,7 @@ pub struct Rates {
 /// The last line that `ssh` printed, when it does not come there.
 pub fn measure(destination: &str) -> Result<Rates, String> {
     let there = format!(
-        "sh -c 'n=0; while [ $n -lt {LINES} ]; do read line; echo; n=$((n+1)); done; head -c {BYTES} /dev/zero; cat >/dev/null'"
+        "sh -c 'n=0; while [ $n -lt {LINES} ]; do read line; echo; n=$((n+1)); done; dd if=/dev/zero bs={AT_ONCE} count={BLOCKS} 2>/dev/null; cat >/dev/null'"
     );
     // Zeros are quick to make, and images, which are compressed already, pass no quicker where `ssh` compresses.
     let mut child = spawn(destination, &["-o", "Compression=no"], &there)?;
