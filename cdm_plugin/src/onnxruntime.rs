@@ -63,7 +63,7 @@ pub struct OnnxNetwork {
     description: String,
     device: Device,
     bound: Kept<NetShape, Bound>,
-    /// Whether the last of them is what was prepared last.
+    /// The last of them is what was prepared last.
     is_prepared: bool,
     session: Session,
     /// After the session, which reads them.

@@ -48,7 +48,7 @@ pub fn measure(destination: &str) -> Result<Rates, String> {
     }
 }
 
-/// What was seen until the last byte was sent.
+/// Facts until the last byte was sent.
 struct Times {
     round_trip_us: f64,
     /// When the first byte came.

@@ -1,4 +1,4 @@
-//! What is bound for each size of images: rigs have few, which take turns.
+//! Values by size of images: rigs have few sizes, which take turns.
 
 /// Sizes that are kept; the oldest goes. More than a rig has.
 const SIZES: usize = 8;
@@ -12,7 +12,7 @@ impl<K: PartialEq, T> Kept<K, T> {
         Self(Vec::new())
     }
 
-    /// Whether there is a value for `size`, which is the last one then. Allocates nothing.
+    /// Makes the value for `size` the last one; `false` without such a value. Allocates nothing.
     pub(super) fn turn_to(&mut self, size: &K) -> bool {
         let found = self.0.iter().position(|(known, _)| known == size);
         if let Some(at) = found {

@@ -130,7 +130,7 @@ fn rates_of(host: &Name, rates: &Rates) -> Finding {
     Finding::new(Severity::Info, "host_reached", what, why, "nothing to do")
 }
 
-/// What the daemon of a computer would be refused for, or lacks.
+/// The reason that a daemon would be refused, or the cameras that it lacks.
 fn daemon(config: &RigConfig, host: &Name, status: &RigStatus) -> Option<Finding> {
     let insecure = config.link.as_ref().is_some_and(|link| link.insecure);
     let is_here = |name: &String| config.cameras.iter().any(|camera| camera.name.as_str() == name);
@@ -162,7 +162,7 @@ fn daemon(config: &RigConfig, host: &Name, status: &RigStatus) -> Option<Finding
     })
 }
 
-/// Whether streams that come here live fit through the way.
+/// Holds the streams that come here live against the rate of the way.
 fn mirrored<'a>(
     host: &Name,
     wanted: impl Iterator<Item = &'a StreamId>,

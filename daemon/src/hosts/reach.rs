@@ -1,4 +1,4 @@
-//! The way to the daemon of another computer, and whether what answers there is one of this rig.
+//! The way to the daemon of another computer, and reasons to refuse what answers there.
 
 use crate::config::{HostConfig, Reach};
 use crate::status::RigStatus;

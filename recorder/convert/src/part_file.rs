@@ -24,7 +24,7 @@ pub fn open_part(path: &Path) -> io::Result<File> {
     }
 }
 
-/// Whether `path` is the name of this file.
+/// Compares the file that is open with the one that `path` names.
 fn is_named(file: &File, path: &Path) -> bool {
     let both = file.metadata().and_then(|open| Ok((open, path.metadata()?)));
     both.is_ok_and(|(open, named)| (open.dev(), open.ino()) == (named.dev(), named.ino()))

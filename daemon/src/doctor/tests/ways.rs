@@ -44,7 +44,7 @@ fn ways_to_other_computers_are_judged_by_their_rate() {
     assert!(text.contains("Permission denied") && text.contains("ssh-copy-id lab@left"), "{text}");
 }
 
-/// What left's daemon answers when all is well.
+/// The answer of left's daemon when all is well.
 fn left() -> RigStatus {
     let stream = |id: &str, format: &str| StreamStatus {
         id: id.into(),
