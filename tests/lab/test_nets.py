@@ -20,7 +20,7 @@ from depthrig.lab.config import ModelConfig
 from depthrig.lab.nets import Cdm, NoiseNet, Tiny, build, load_weights
 from depthrig.lab.nets.export import export_tiny
 from depthrig.lab.nets.planes import GUESSES, RIDGE, planes
-from depthrig.lab.nets.tiny import tiny_inputs
+from depthrig.lab.nets.tiny import STAY, tiny_inputs
 from depthrig.lab.nets.vit import SIZES, Size
 
 torch.set_num_threads(1)
@@ -143,7 +143,7 @@ def test_tiny_begins_on_the_way_from_filled_depth_to_the_plane_around() -> None:
         color = torch.zeros(1, 3, 64, 96)
         out = Tiny(8).eval()(tiny_inputs(color, filled, raw), filled)
         # All three guesses are the plane: 3 parts of sigmoid(-2), less what is too little to move.
-        expected = 3 / (1 + math.exp(2)) * math.log(2) - 0.07
+        expected = 3 / (1 + math.exp(2)) * math.log(2) - STAY
         torch.testing.assert_close((out / filled).log()[hole], torch.full([32 * 32], expected), atol=0.01, rtol=0)
 
 

@@ -27,8 +27,8 @@ DILATIONS = ((1, 2, 1), (1, 2, 4, 8, 1))
 """Of the blocks of each stage on the way down: holes are often larger than what plain blocks see."""
 REACH = 2.0
 """The largest |r|."""
-STAY, STAY_TRAINING = 0.07, 0.02
-"""|r| becomes smaller by this, down to 0; while training by less, as what is 0 does not learn."""
+STAY = 0.02
+"""|r| becomes smaller by this, down to 0."""
 KEPT = 1e-3
 """Measured depth that filling changed by more than this part was wrong, and counts as a hole."""
 
@@ -121,6 +121,5 @@ class Tiny(nn.Module):
             ways = (guesses / here).log().clamp(-REACH, REACH)
             r = (torch.sigmoid(parts[:, :-1]) * ways).sum(1, keepdim=True) + parts[:, -1:]
             r = r.clamp(-REACH, REACH)
-            stay = STAY_TRAINING if self.training else STAY
-            r = hole * (r - r.clamp(-stay, stay))
+            r = hole * (r - r.clamp(-STAY, STAY))
             return filled * torch.exp(r.squeeze(1))
