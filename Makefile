@@ -78,6 +78,7 @@ lint: ## formatting and lints, as CI runs them
 	@if command -v cargo-deny >/dev/null; then cargo deny check; else echo "cargo-deny is not installed: licences not checked"; fi
 
 lab-demo: setup-build $(LEROBOT)/.stamp ## the depth lab in a quarter of an hour: makes scenes, trains a very small network, evaluates it, serves it live
+	tools/onnxruntime.sh
 	tools/lab-demo.sh $(ARGS)
 
 train-tiny: setup-build $(LEROBOT)/.stamp ## the refiner `tiny`: makes its data, trains, measures, writes cdm_plugin/models/tiny.{onnx,toml}
