@@ -133,6 +133,12 @@ impl Host {
     fn is_connected(&self) -> bool {
         lock(&self.seen).state == HostState::Connected
     }
+
+    /// It records a part of `session`, as it was seen last: one that was asked for may not have begun.
+    fn records_part_of(&self, session: &Session) -> bool {
+        let recorded = lock(&self.seen).recording.clone();
+        session.parts.iter().any(|part| recorded.as_deref() == Some(&part.name))
+    }
 }
 
 impl Hosts {
@@ -201,7 +207,7 @@ impl Hosts {
     /// seconds at most.
     pub fn begin(&self, here: &RecordingStatus, request: &RecordRequest) {
         lock(&self.sessions).begin(here, request);
-        self.settle(|host, session| session.has_part(host) || session.excuse(host).is_some());
+        self.settle(|host, session| host.records_part_of(session) || session.excuse(host).is_some());
     }
 
     /// A recording ends here: the hosts end their parts at the same time.
@@ -212,10 +218,7 @@ impl Hosts {
 
     /// Waits until the hosts that answer have ended their parts, for some seconds at most.
     pub fn wait_ended(&self) {
-        self.settle(|host, session| {
-            let recorded = lock(&host.seen).recording.clone();
-            !session.parts.iter().any(|part| recorded.as_deref() == Some(&part.name))
-        });
+        self.settle(|host, session| !host.records_part_of(session));
     }
 
     /// Wakes the threads of all hosts, and waits until `is_done` of each that is connected and the newest session.

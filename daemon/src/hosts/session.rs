@@ -69,10 +69,6 @@ struct WrittenPart {
 }
 
 impl Session {
-    pub(super) fn has_part(&self, host: &Host) -> bool {
-        self.parts.iter().any(|part| part.host == host.config.name)
-    }
-
     /// Why a host has no part, or its part does not go on.
     pub(super) fn excuse(&self, host: &Host) -> Option<&String> {
         self.excuses.get(&host.config.name)
