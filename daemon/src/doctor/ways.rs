@@ -86,9 +86,9 @@ pub(super) fn check(config: &RigConfig, ways: &[Way], findings: &mut Vec<Finding
         };
         match &way.daemon {
             Some(Ok(status)) => {
-                let before = findings.len();
-                findings.extend(daemon(config, &way.host, status));
-                if findings.len() == before {
+                if let Some(finding) = daemon(config, &way.host, status) {
+                    findings.push(finding);
+                } else {
                     let hosts = config.link.iter().flat_map(|link| &link.hosts);
                     let wanted = hosts.filter(|host| host.name == way.host).flat_map(|host| &host.mirror);
                     findings.extend(mirrored(&way.host, wanted, status, rates));

@@ -67,7 +67,8 @@ mod tests {
         let part = dir.path().join("a.part");
         std::thread::scope(|scope| {
             for thread in 0..4 {
-                let (part, dir) = (&part, dir.path());
+                let part = &part;
+                let dir = dir.path();
                 scope.spawn(move || {
                     for _ in 0..5000 {
                         let Ok(mut file) = open_part(part) else { continue };
