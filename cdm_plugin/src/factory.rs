@@ -28,7 +28,7 @@ pub fn refiner(options: &RefinerOptions) -> Result<Box<dyn Refiner>> {
         return Err(Error::new(ErrorKind::BadInput, message));
     };
     let network = OnnxNetwork::open(model, options)?;
-    Ok(Box::new(CdmRefiner::new(Box::new(network), model, options.input_size)?))
+    Ok(Box::new(CdmRefiner::new(Box::new(network), model, options.input_size, options.thread_count())?))
 }
 
 #[cfg(test)]

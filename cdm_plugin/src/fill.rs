@@ -14,6 +14,7 @@
 // The steps of a pixel must end up inside the loops that are compiled for AVX2, whatever their size.
 #![allow(clippy::inline_always)]
 
+use crate::workers::Workers;
 use crate::{
     Color, ColorFormat, Description, Error, ErrorKind, Job, Output, RawDepth, Refiner, Result, StepTimes,
 };
@@ -22,7 +23,6 @@ use clean::Islands;
 use depthrig_bus::HostTime;
 use pyramid::Level;
 use reach::Reach;
-use workers::Workers;
 
 mod behind;
 mod clean;
@@ -30,7 +30,6 @@ mod load;
 mod pull;
 mod pyramid;
 mod reach;
-mod workers;
 
 /// Islands below this part of the image are taken out: 60 pixels of 1280x720.
 const ISLAND: f64 = 65e-6;
@@ -71,10 +70,7 @@ impl FillRefiner {
     /// # Errors
     /// [`ErrorKind::Engine`] when the threads cannot be made.
     pub fn new(threads: usize) -> Result<Self> {
-        let workers = Workers::new(threads).map_err(|e| {
-            let message = format!("the {threads} threads to fill depth cannot be started ({e}); use fewer");
-            Error::new(ErrorKind::Engine, message).with_source(e)
-        })?;
+        let workers = Workers::new(threads)?;
         let description = Description { engine: "fill".into(), model: String::new() };
         Ok(Self {
             description,

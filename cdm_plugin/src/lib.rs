@@ -28,6 +28,7 @@ mod stereo_network;
 pub mod store;
 pub mod tiny;
 pub mod weights;
+mod workers;
 
 pub use arch::Encoder;
 pub use error::{Error, ErrorKind, Result};

@@ -1,11 +1,13 @@
 //! The refiner that is a network: images to its input, the network, its output to depth.
 
 use crate::prep::{Positions, Prep, check_input_size, net_size};
+use crate::workers::Workers;
 use crate::{
     ChannelOrder, Description, Error, Job, Model, NetShape, Network, PositionEmbeddings, Refiner, Result,
     StepTimes,
 };
 use depthrig_bus::HostTime;
+use std::sync::Arc;
 
 /// Sizes of images, and of the network's input, that tables are kept for: more than a rig has.
 const PREPS: usize = 16;
@@ -24,6 +26,7 @@ pub struct CdmRefiner {
     max_depth_m: f64,
     positions: Positions,
     kept: Kept,
+    workers: Arc<Workers>,
     prepared: Option<NetShape>,
     x: Vec<f32>,
     y: Vec<f32>,
@@ -42,14 +45,20 @@ struct Kept {
 
 impl Kept {
     /// The tables for the size and the unit of `job`.
-    fn prep(&mut self, job: &Job<'_>, input_size: u32, max_depth_m: f64) -> Result<&mut Prep> {
+    fn prep(
+        &mut self,
+        workers: &Arc<Workers>,
+        job: &Job<'_>,
+        input_size: u32,
+        max_depth_m: f64,
+    ) -> Result<&mut Prep> {
         let image = (job.color.width, job.color.height);
         let unit_m = job.depth.unit_m;
         let known = self.preps.iter().position(|(unit, prep)| *unit == unit_m && prep.image() == image);
         let i = if let Some(i) = known {
             i
         } else {
-            let prep = Prep::new(image.0, image.1, input_size, max_depth_m)?;
+            let prep = Prep::with_workers(Arc::clone(workers), image.0, image.1, input_size, max_depth_m)?;
             if self.preps.len() == PREPS {
                 self.preps.remove(0);
             }
@@ -73,12 +82,18 @@ impl Kept {
 }
 
 impl CdmRefiner {
-    /// A refiner that runs `network`, which has the weights of `model`; `input_size` in place of the model's own.
+    /// A refiner that runs `network`, which has the weights of `model`; `input_size` in place of the model's own. `threads`
+    /// threads prepare and finish; 0 and 1 mean the caller's own.
     ///
     /// # Errors
     /// [`crate::ErrorKind::BadInput`] for an input size that cannot be used, [`crate::ErrorKind::BadModel`] when the
-    /// model has no position embeddings.
-    pub fn new(network: Box<dyn Network>, model: &Model, input_size: Option<u32>) -> Result<Self> {
+    /// model has no position embeddings, [`crate::ErrorKind::Engine`] when the threads cannot be started.
+    pub fn new(
+        network: Box<dyn Network>,
+        model: &Model,
+        input_size: Option<u32>,
+        threads: usize,
+    ) -> Result<Self> {
         let input_size = input_size.unwrap_or(model.input_size);
         check_input_size(input_size)?;
         let description = Description { engine: network.describe().into(), model: model.id.clone() };
@@ -90,6 +105,7 @@ impl CdmRefiner {
             max_depth_m: model.max_depth_m,
             positions: Positions::read(&model.encoder.architecture(), &model.weights)?,
             kept: Kept::default(),
+            workers: Arc::new(Workers::new(threads)?),
             prepared: None,
             x: Vec::new(),
             y: Vec::new(),
@@ -115,7 +131,7 @@ impl CdmRefiner {
             let job = &mut jobs[*i];
             let started = HostTime::now();
             let x = &mut self.x[self.batch.len() * x_len..][..x_len];
-            let prep = self.kept.prep(job, self.input_size, self.max_depth_m)?;
+            let prep = self.kept.prep(&self.workers, job, self.input_size, self.max_depth_m)?;
             if prep.prepare(&job.color, &job.depth, self.channel_order, x)? {
                 self.batch.push(*i);
             } else {
@@ -139,7 +155,7 @@ impl CdmRefiner {
             let job = &mut jobs[*i];
             let started = HostTime::now();
             job.steps.infer_ns = share;
-            self.kept.prep(job, self.input_size, self.max_depth_m)?.finish(y, &mut job.out)?;
+            self.kept.prep(&self.workers, job, self.input_size, self.max_depth_m)?.finish(y, &mut job.out)?;
             job.steps.finish_ns = since(started);
         }
         Ok(())

@@ -62,7 +62,7 @@ fn model() -> Model {
 fn nothing_is_allocated_per_image() {
     let mirror = Mirror(NetShape { batch: 0, height: 0, width: 0 });
     let (units, metres, inverse) =
-        refine_often(&mut CdmRefiner::new(Box::new(mirror), &model(), None).unwrap());
+        refine_often(&mut CdmRefiner::new(Box::new(mirror), &model(), None, 1).unwrap());
     assert!(units.iter().all(|d| *d == 3000) && metres.iter().all(|d| *d == 1.5));
     assert!(inverse.iter().all(|d| (d - 1.0 / 1.5).abs() < 1e-7));
     let (units, metres, _) = refine_often(&mut FillRefiner::new(1).unwrap());

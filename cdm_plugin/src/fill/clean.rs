@@ -3,7 +3,7 @@
 //!
 //! Depth is compared as inverse depth `q` (1/m) and relative to itself, so that the same rule holds near and far.
 
-use super::workers::wide;
+use crate::workers::wide;
 
 /// How much two neighbours on one surface may differ, relative to their inverse depth: noise and slant of ordinary
 /// cameras stay below, flying pixels beyond.

@@ -1,6 +1,6 @@
 //! From images as cameras give them to the form in which they are worked on, and back.
 
-use super::workers::{Workers, wide};
+use crate::workers::{Workers, wide};
 use crate::{Color, ColorFormat, Output, RawDepth};
 
 /// Value that cameras report beyond their range.

@@ -2,7 +2,7 @@
 //! rid of noise.
 
 use super::pyramid::Level;
-use super::workers::{Workers, wide};
+use crate::workers::{Workers, wide};
 
 /// The difference of colours (root of the sum of squares, of 255) at which a cell counts a quarter.
 const COLOR: f32 = 18.0;

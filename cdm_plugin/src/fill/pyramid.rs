@@ -1,7 +1,7 @@
 //! The same image ever smaller: inverse depth where there is some, the colour it was seen with, and how much of each
 //! cell it covers.
 
-use super::workers::{Workers, wide};
+use crate::workers::{Workers, wide};
 
 /// An image at one size. `q` is inverse depth in 1/m, 0 in a hole; `share` is how much of the cell had depth, 0 to 1.
 #[derive(Debug, Default)]

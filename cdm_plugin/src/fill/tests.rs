@@ -1,6 +1,7 @@
 //! The steps together; each has its own tests beside it.
 
 use super::*;
+use crate::workers::Wide;
 use crate::{Color, ColorFormat, RawDepth};
 use proptest::prelude::*;
 
@@ -194,7 +195,7 @@ proptest! {
         let mut three = FillRefiner::new(3).unwrap();
         prop_assert!(bits(&refined(&mut three, (w, h), &color, &depth)) == bits(&first), "three threads");
         let mut plain = FillRefiner::new(1).unwrap();
-        plain.workers.wide = workers::Wide::none();
+        plain.workers.wide = Wide::none();
         prop_assert!(bits(&refined(&mut plain, (w, h), &color, &depth)) == bits(&first), "without AVX2");
     }
 
@@ -250,7 +251,7 @@ proptest! {
         let q: Vec<f32> = depth.iter().map(|d| if *d == 0 { 0.0 } else { 1000.0 / f32::from(*d) }).collect();
         for y in 0..h {
             let mut row = vec![9.0; w];
-            clean::keep_supported(workers::Wide::detect(), &q, w, y, &mut row);
+            clean::keep_supported(Wide::detect(), &q, w, y, &mut row);
             for x in 0..w {
                 let here = q[y * w + x];
                 let mut n = 0;

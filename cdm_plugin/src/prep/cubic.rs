@@ -44,48 +44,52 @@ pub(super) fn weights(t: f32) -> [f32; 4] {
     [w0, w1, w2, 1.0 - w0 - w1 - w2]
 }
 
-/// Tables for one size of image and of input, and one row of scratch memory.
+/// Tables for one size of image and of input.
 #[derive(Debug)]
 pub(super) struct CubicResize {
     rows: Taps,
     columns: Taps,
+    width: usize,
     height: usize,
-    /// One row of the image's width with its border, three numbers a pixel, and one more so that four can be read at
-    /// the last.
-    line: Vec<f32>,
 }
 
 impl CubicResize {
     pub(super) fn new(width: usize, height: usize, net_width: usize, net_height: usize) -> Self {
-        Self {
-            rows: Taps::new(height, net_height),
-            columns: Taps::new(width, net_width),
-            height,
-            line: vec![0.0; 3 * (width + 2 * BORDER) + 1],
-        }
+        Self { rows: Taps::new(height, net_height), columns: Taps::new(width, net_width), width, height }
     }
 
-    /// Writes three planes, in `order`, normalised.
-    pub(super) fn run(&mut self, color: &Color<'_>, order: ChannelOrder, planes: &mut [f32]) {
+    /// Scratch memory of [`Self::run`]: one row of the image's width with its border, three numbers a pixel, and one more
+    /// so that four can be read at the last.
+    pub(super) fn line(&self) -> Vec<f32> {
+        vec![0.0; 3 * (self.width + 2 * BORDER) + 1]
+    }
+
+    /// Writes rows of the three planes from the row `first` on, normalised; `line` is what [`Self::line`] made.
+    #[inline(always)]
+    pub(super) fn run(
+        &self,
+        color: &Color<'_>,
+        scale: &Normalise,
+        first: usize,
+        line: &mut [f32],
+        [a, b, c]: [&mut [f32]; 3],
+    ) {
         let width = self.columns.first.len();
-        let plane = width * self.rows.first.len();
-        let scale = Normalise::new(color, order);
         // The planes by byte of a pixel.
-        let (a, rest) = planes.split_at_mut(plane);
-        let (b, c) = rest.split_at_mut(plane);
         let [a, b, c] = if scale.swapped { [c, b, a] } else { [a, b, c] };
         let outputs = a.chunks_exact_mut(width).zip(b.chunks_exact_mut(width)).zip(c.chunks_exact_mut(width));
         let last = self.height as i32 - 1;
-        for ((first, weights), ((a, b), c)) in self.rows.first.iter().zip(&self.rows.weights).zip(outputs) {
+        let taps = self.rows.first.iter().zip(&self.rows.weights).skip(first);
+        for ((first, weights), ((a, b), c)) in taps.zip(outputs) {
             let row = |k: i32| color.row((first + k).clamp(0, last) as usize);
-            blend_rows([row(0), row(1), row(2), row(3)], weights, &mut self.line);
-            blend_columns(&self.line, &self.columns, &scale, [a, b, c]);
+            blend_rows([row(0), row(1), row(2), row(3)], weights, line);
+            blend_columns(line, &self.columns, scale, [a, b, c]);
         }
     }
 }
 
 /// Factor and offset applied to a blended value of 0 to 255, by byte of a pixel.
-struct Normalise {
+pub(super) struct Normalise {
     factor: [f32; 3],
     offset: [f32; 3],
     /// Whether the first byte of a pixel goes to the last plane.
@@ -93,7 +97,7 @@ struct Normalise {
 }
 
 impl Normalise {
-    fn new(color: &Color<'_>, order: ChannelOrder) -> Self {
+    pub(super) fn new(color: &Color<'_>, order: ChannelOrder) -> Self {
         use crate::ColorFormat::{Bgr8, Rgb8};
         let swapped = !matches!((color.format, order), (Rgb8, ChannelOrder::Rgb) | (Bgr8, ChannelOrder::Bgr));
         let of = |f: fn(f64, f64) -> f64| {
@@ -110,6 +114,7 @@ impl Normalise {
 }
 
 /// Four rows of bytes with their weights, into `line` between its borders, which then repeat the first and last pixel.
+#[inline(always)]
 fn blend_rows(rows: [&[u8]; 4], w: &[f32; 4], line: &mut [f32]) {
     let n = rows[0].len();
     let [r0, r1, r2, r3] = rows.map(|r| &r[..n]);
@@ -131,6 +136,7 @@ fn blend_rows(rows: [&[u8]; 4], w: &[f32; 4], line: &mut [f32]) {
 }
 
 /// Four columns with their weights for each pixel, normalised, to one row of each plane.
+#[inline(always)]
 fn blend_columns(line: &[f32], columns: &Taps, scale: &Normalise, planes: [&mut [f32]; 3]) {
     let [a, b, c] = planes;
     let places = columns.first.iter().zip(&columns.weights);

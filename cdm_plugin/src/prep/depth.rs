@@ -37,6 +37,7 @@ impl DepthTable {
     }
 
     /// Inverse depth at the given rows and columns of `raw`; whether any of it is above 0.
+    #[inline(always)]
     pub(super) fn sample(
         &self,
         raw: &[u16],

@@ -3,6 +3,7 @@
 use super::*;
 use crate::ColorFormat;
 use crate::ErrorKind::{self, BadInput, SizeMismatch};
+use crate::workers::Wide;
 use proptest::prelude::*;
 
 #[test]
@@ -97,6 +98,51 @@ proptest! {
             }
         }
         prop_assert!(x[3 * plane..].iter().all(|v| *v == 0.0));
+    }
+
+    /// The same bits with any number of threads, with and without AVX2, also of depth that one band of rows has alone.
+    #[test]
+    fn bits_depend_on_the_images_alone(
+        (width, height, pixels) in (1usize..60, 1usize..60).prop_flat_map(|(w, h)| {
+            (Just(w), Just(h), prop::collection::vec(any::<u8>(), 3 * w * h))
+        }),
+        input_size in 14u32..90,
+        lone in any::<prop::sample::Index>(),
+        dense in any::<bool>(),
+    ) {
+        let Ok(one) = Prep::new(width, height, input_size, 6.0) else { return Ok(()) };
+        let plane = one.net().0 * one.net().1;
+        prop_assume!(plane < 40_000);
+        let color = Color { pixels: &pixels, format: ColorFormat::Bgr8, width, height, stride: 3 * width };
+        let mut depth = vec![0u16; width * height];
+        depth[lone.index(width * height)] = 1234;
+        if dense {
+            depth.iter_mut().zip(&pixels).for_each(|(d, p)| *d += 700 + u16::from(*p));
+        }
+        let raw = RawDepth { pixels: &depth, unit_m: 0.001 };
+        let run = |mut prep: Prep| {
+            let mut x = vec![f32::NAN; 4 * plane];
+            let has_depth = prep.prepare(&color, &raw, ChannelOrder::Rgb, &mut x).unwrap();
+            let mut units = vec![7u16; width * height];
+            let mut metres = vec![7.0f32; width * height];
+            let mut inverse = metres.clone();
+            let y = &x[3 * plane..];
+            prep.finish(y, &mut Output::Units { pixels: &mut units, unit_m: 0.001 }).unwrap();
+            prep.finish(y, &mut Output::Metres(&mut metres)).unwrap();
+            prep.finish(y, &mut Output::Inverse(&mut inverse)).unwrap();
+            let bits = |numbers: Vec<f32>| numbers.into_iter().map(f32::to_bits).collect::<Vec<_>>();
+            (has_depth, bits(x), units, bits(metres), bits(inverse))
+        };
+        let on = |threads, wide: Option<Wide>| {
+            let mut workers = Workers::new(threads).unwrap();
+            workers.wide = wide.unwrap_or(workers.wide);
+            run(Prep::with_workers(Arc::new(workers), width, height, input_size, 6.0).unwrap())
+        };
+        let first = run(one);
+        prop_assert_eq!(first.0, first.1[3 * plane..].iter().any(|bits| *bits != 0));
+        prop_assert!(on(3, None) == first, "three threads");
+        prop_assert!(on(7, None) == first, "seven threads");
+        prop_assert!(on(1, Some(Wide::none())) == first, "without AVX2");
     }
 }
 

@@ -83,7 +83,7 @@ fn refiner(batch: usize, change: impl FnOnce(&mut Mirror)) -> (CdmRefiner, Arc<M
     let log = Arc::new(Mutex::new(Log::default()));
     let mut mirror = Mirror { log: Arc::clone(&log), shape: None, batch, answer: None, fails: false };
     change(&mut mirror);
-    (CdmRefiner::new(Box::new(mirror), &model(folder.path()), None).unwrap(), log)
+    (CdmRefiner::new(Box::new(mirror), &model(folder.path()), None, 2).unwrap(), log)
 }
 
 /// One pair and room for its result.
@@ -237,9 +237,9 @@ fn input_sizes_that_cannot_be() {
     let mirror =
         || Box::new(Mirror { log: Arc::default(), shape: None, batch: 1, answer: None, fails: false });
     let model = model(folder.path());
-    let error = CdmRefiner::new(mirror(), &model, Some(13)).err().unwrap();
+    let error = CdmRefiner::new(mirror(), &model, Some(13), 1).err().unwrap();
     assert!(error.kind() == ErrorKind::BadInput && error.to_string().contains("13"), "{error}");
     let vitb = Model { encoder: Encoder::Vitb, ..model };
-    let error = CdmRefiner::new(mirror(), &vitb, Some(28)).err().unwrap();
+    let error = CdmRefiner::new(mirror(), &vitb, Some(28), 1).err().unwrap();
     assert!(error.kind() == ErrorKind::BadModel && error.to_string().contains("pos_embed"), "{error}");
 }

@@ -1,5 +1,9 @@
 //! Runs rows of images on one or several threads, and selects the processor's SIMD instructions.
+//!
+//! The body of a function made with [`wide`] calls functions that are `#[inline(always)]` alone, else those are compiled for
+//! the oldest processor.
 
+use crate::{Error, ErrorKind, Result};
 use rayon::prelude::*;
 
 /// Rows per task, so that scheduling costs little.
@@ -7,12 +11,12 @@ const ROWS: usize = 8;
 
 /// SIMD support of this processor, as detected.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Wide {
+pub(crate) struct Wide {
     has_avx2: bool,
 }
 
 impl Wide {
-    pub(super) fn detect() -> Self {
+    pub(crate) fn detect() -> Self {
         #[cfg(target_arch = "x86_64")]
         let has_avx2 = std::arch::is_x86_feature_detected!("avx2");
         #[cfg(not(target_arch = "x86_64"))]
@@ -22,11 +26,11 @@ impl Wide {
 
     /// Assumes the baseline instructions only.
     #[cfg(test)]
-    pub(super) const fn none() -> Self {
+    pub(crate) const fn none() -> Self {
         Self { has_avx2: false }
     }
 
-    pub(super) const fn has_avx2(self) -> bool {
+    pub(crate) const fn has_avx2(self) -> bool {
         self.has_avx2
     }
 }
@@ -37,7 +41,7 @@ macro_rules! wide {
     ($(#[$meta:meta])* $vis:vis fn $name:ident($($arg:ident: $type:ty),* $(,)?) $body:block) => {
         $(#[$meta])*
         #[allow(unsafe_code, clippy::too_many_arguments)] // called only after detection
-        $vis fn $name(wide: $crate::fill::workers::Wide, $($arg: $type),*) {
+        $vis fn $name(wide: $crate::workers::Wide, $($arg: $type),*) {
             #[inline(always)]
             #[allow(clippy::too_many_arguments, clippy::inline_always)]
             fn body($($arg: $type),*) $body
@@ -60,27 +64,63 @@ macro_rules! wide {
         }
     };
 }
-pub(super) use wide;
+pub(crate) use wide;
 
 /// Worker threads. A row's result does not depend on the thread or on the other rows.
 #[derive(Debug)]
-pub(super) struct Workers {
+pub(crate) struct Workers {
     pool: Option<rayon::ThreadPool>,
-    pub(super) wide: Wide,
+    pub(crate) wide: Wide,
 }
 
 impl Workers {
     /// Starts `threads` threads; 0 and 1 use the caller's thread.
-    pub(super) fn new(threads: usize) -> Result<Self, rayon::ThreadPoolBuildError> {
+    ///
+    /// # Errors
+    /// [`ErrorKind::Engine`] when the threads cannot be started.
+    pub(crate) fn new(threads: usize) -> Result<Self> {
         let build = || {
-            let name = |i| format!("fill-{i}");
+            let name = |i| format!("refine-{i}");
             rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(name).build()
         };
-        Ok(Self { pool: (threads > 1).then(build).transpose()?, wide: Wide::detect() })
+        let pool = (threads > 1).then(build).transpose().map_err(|e| {
+            let message = format!("the {threads} threads to refine depth cannot be started ({e}); use fewer");
+            Error::new(ErrorKind::Engine, message).with_source(e)
+        })?;
+        Ok(Self { pool, wide: Wide::detect() })
+    }
+
+    /// How many threads there are, and so how many bands of rows are worth making.
+    pub(crate) fn threads(&self) -> usize {
+        self.pool.as_ref().map_or(1, rayon::ThreadPool::current_num_threads)
+    }
+
+    /// Calls `work` with the first row of every band, its part of `scratch` and its rows of each plane. The planes have rows of
+    /// `width` elements and the same number of them; there are as many bands as `scratch` is long, or fewer of few rows.
+    pub(crate) fn bands<S: Send, T: Send, const N: usize>(
+        &self,
+        scratch: &mut [S],
+        planes: [&mut [T]; N],
+        width: usize,
+        work: impl Fn(usize, &mut S, [&mut [T]; N]) + Sync,
+    ) {
+        let rows = planes.first().map_or(0, |plane| plane.len() / width.max(1));
+        let band = rows.div_ceil(scratch.len().max(1)).max(ROWS);
+        let mut rest = planes.map(|plane| plane.chunks_mut((band * width).max(1)));
+        let bands = scratch.iter_mut().zip((0..rows).step_by(band)).map(|(scratch, first)| {
+            (first, scratch, rest.each_mut().map(|chunks| chunks.next().unwrap_or_default()))
+        });
+        match &self.pool {
+            None => bands.for_each(|(first, scratch, rows)| work(first, scratch, rows)),
+            Some(pool) => pool.in_place_scope(|scope| {
+                let work = &work;
+                bands.for_each(|(first, scratch, rows)| scope.spawn(move |_| work(first, scratch, rows)));
+            }),
+        }
     }
 
     /// Calls `work` with the number of every row of `width` elements and the row.
-    pub(super) fn rows<T: Send>(&self, out: &mut [T], width: usize, work: impl Fn(usize, &mut [T]) + Sync) {
+    pub(crate) fn rows<T: Send>(&self, out: &mut [T], width: usize, work: impl Fn(usize, &mut [T]) + Sync) {
         match &self.pool {
             None => out.chunks_mut(width).enumerate().for_each(|(y, row)| work(y, row)),
             Some(pool) => pool.install(|| {
@@ -91,7 +131,7 @@ impl Workers {
     }
 
     /// Like [`Self::rows`], for two images of one size at once.
-    pub(super) fn rows2<A: Send, B: Send>(
+    pub(crate) fn rows2<A: Send, B: Send>(
         &self,
         a: &mut [A],
         b: &mut [B],
@@ -111,7 +151,7 @@ impl Workers {
     }
 
     /// Like [`Self::rows`], for three images.
-    pub(super) fn rows3<A: Send, B: Send, C: Send>(
+    pub(crate) fn rows3<A: Send, B: Send, C: Send>(
         &self,
         a: &mut [A],
         b: &mut [B],
