@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Makes the refiner `tiny` from nothing: data, training, gates, and the files that ship. What is there is left alone, so
 # the same command goes on after an interruption. Everything is below target/tiny but for the two files that ship:
-# cdm_plugin/models/tiny.onnx and tiny.toml. The data are 2 GB.
+# cdm_plugin/models/tiny.onnx and tiny.toml. The data are 4.6 GB.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 config=cdm_plugin/models/tiny-train.toml

@@ -227,8 +227,12 @@ def test_irs_is_disparity_in_the_green_channel(tmp_path: Path) -> None:
         exr(tmp_path / "Home/a" / f"d_{i}.exr", G=disparity)
         lines.append(f"Home/a/l_{i}.png Home/a/r_{i}.png Home/a/d_{i}.exr Home/a/n_{i}.exr\n")
     (tmp_path / "lists").mkdir()
-    (tmp_path / "lists/IRSDataset_TRAIN.list").write_text("".join(lines))
-    (tmp_path / "lists/IRSDataset_TEST.list").write_text(lines[0])
+    (tmp_path / "lists/irs_train.list").write_text("".join(lines))
+    (tmp_path / "lists/irs_test.list").write_text(lines[0])
+    # Parts of the others, and one of another layout, as published.
+    (tmp_path / "lists/home_test.list").write_text(lines[0])
+    (tmp_path / "lists/irs_small_train.list").write_text(lines[0])
+    (tmp_path / "lists/test.list").write_text(lines[0].replace("Home/", "IRSDataset/Home/"))
     source = open_("irs", tmp_path)
     assert len(source) == 2
     got = source[1]
@@ -236,8 +240,11 @@ def test_irs_is_disparity_in_the_green_channel(tmp_path: Path) -> None:
     np.testing.assert_allclose(got.truth[1:], 2.0, rtol=1e-6)
     assert got.raw is None
     assert len(open_("irs", tmp_path, split="test")) == 1
-    (tmp_path / "lists/IRSDataset_TRAIN.list").write_text("one two\n")
+    (tmp_path / "lists/irs_train.list").write_text("one two\n")
     with pytest.raises(LabError, match="line 1 is not LEFT RIGHT"):
+        open_("irs", tmp_path)
+    (tmp_path / "lists/irs_train.list").unlink()
+    with pytest.raises(LabError, match="no lists/irs_train.list"):
         open_("irs", tmp_path)
 
 

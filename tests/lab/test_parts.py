@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import sys
 from pathlib import Path
 
@@ -11,10 +13,11 @@ import pytest
 torch = pytest.importorskip("torch", reason="PyTorch is not installed")
 
 from depthrig.lab import LabError, make_shards, ray
-from depthrig.lab.config import DataConfig
+from depthrig.lab.config import DataConfig, ModelConfig
 from depthrig.lab.data import open_source
-from depthrig.lab.nets import NoiseNet
+from depthrig.lab.nets import NoiseNet, noise_net
 from depthrig.lab.nets.vit import SIZES, Size
+from depthrig.lab.sample import Licence
 from depthrig.lab.shards import ShardWriter, list_shards
 
 from made import sample
@@ -63,6 +66,71 @@ def test_parts_make_what_the_whole_makes(tmp_path: Path) -> None:
     for i in range(5):
         assert np.array_equal(source[i].truth, sample(i, 40, 56).truth)
         assert not np.array_equal(source[i].raw, sample(i, 40, 56).raw)
+
+
+def test_a_folder_holds_shards_of_one_making(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = make_config(tmp_path)
+    out = tmp_path / "out"
+
+    def made(text: str, *options: str) -> tuple[int, str]:
+        path.write_text(text)
+        return make_shards.main([str(path), str(out), *options]), capsys.readouterr().err
+
+    text = path.read_text()
+    assert made(text, "--per-shard", "2") == (0, "")
+    kept = {p.name: p.read_bytes() for p in out.iterdir()}
+    for changed, options, what in (
+        (f"seed = 9\n{text}", ("--per-shard", "2"), "seed"),
+        (text.replace("4.0", "5.0"), ("--per-shard", "2"), "synthesis"),
+        (text, ("--per-shard", "3"), "per shard"),
+    ):
+        code, said = made(changed, *options)
+        assert code == 1 and f"another {what}" in said, said
+    assert {p.name: p.read_bytes() for p in out.iterdir()} == kept
+    # Another process at the same shard.
+    (out / "out-000001.tar").unlink()
+    with ShardWriter(out / "out-000001.tar") as writer:
+        code, said = made(text, "--per-shard", "2")
+        assert code == 1 and "another process writes this shard" in said
+        assert writer.part.exists()
+    assert not writer.part.exists(), "nothing was written to it"
+    assert made(text, "--per-shard", "2") == (0, "")
+    assert {p.name: p.read_bytes() for p in out.iterdir()} == kept
+    # A shard of which every sample is left out is no file, and the others are read.
+    monkeypatch.setattr(make_shards, "_usable", lambda sample: "0000000004" not in sample.name)
+    out = tmp_path / "few"
+    assert made(text, "--per-shard", "2") == (0, "")
+    assert [p.name for p in list_shards(out)] == ["out-000000.tar", "out-000001.tar"]
+    assert len(open_source(DataConfig("shards", str(out)))) == 4
+
+
+def test_data_of_two_licences_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = make_config(tmp_path)
+    other = dataclasses.replace(sample(9, 40, 56), licence=Licence("MIT", ships=True))
+    (tmp_path / "more").mkdir()
+    with ShardWriter(tmp_path / "more/made-000000.tar") as writer:
+        writer.write(0, other, FACTS)
+    path.write_text(path.read_text().replace("[synthesis]", '[[data]]\nkind = "shards"\npath = "more"\n[synthesis]'))
+    assert make_shards.main([str(path), str(tmp_path / "out")]) == 1
+    assert "MIT, MIT OR Apache-2.0; make a folder of each" in capsys.readouterr().err
+    assert not list(tmp_path.glob("out/*"))
+
+
+def test_a_value_model_of_the_other_kind_of_sensor_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = make_config(tmp_path, 'value = "value.pt"\n')
+    path.write_text(path.read_text() + '[model]\nkind = "value"\nencoder = "conv"\nwidth = 8\n')
+    torch.save(noise_net(ModelConfig("value", "conv", 8)).state_dict(), tmp_path / "value.pt")
+    assert make_shards.main([str(path), str(tmp_path / "unknown")]) == 0
+    record = {"config": {"synthesis": {"sensor": "tof"}}}
+    (tmp_path / "run.json").write_text(json.dumps(record))
+    assert make_shards.main([str(path), str(tmp_path / "tof")]) == 1
+    assert 'learned from sensor = "tof"' in capsys.readouterr().err
+    (tmp_path / "run.json").write_text(json.dumps(record).replace("tof", "stereo"))
+    assert make_shards.main([str(path), str(tmp_path / "stereo")]) == 0
 
 
 def test_noise_models_draw_and_bad_ones_are_refused(

@@ -24,7 +24,7 @@ from depthrig.lab import LabError, batches, config, losses, metrics, train
 from depthrig.lab.data import open_source
 from depthrig.lab.fill import fill
 from depthrig.lab.nets.vit import SIZES, Size
-from depthrig.lab.sample import MATERIALS
+from depthrig.lab.sample import MATERIALS, Sample
 from depthrig.lab.shards import ShardWriter
 
 from made import sample
@@ -96,6 +96,7 @@ def test_a_killed_run_ends_with_the_same_bits(tmp_path: Path) -> None:
     assert {"raw: images", "filled: pixels", "net: pixels, glass"} <= found.keys()
     kept = json.loads((tmp_path / "killed/run.json").read_text())
     assert kept["config"]["train"]["steps"] == 40
+    assert kept["config"]["processes"] == 1
     assert len(next(iter(kept["data"].values()))) == 64
 
 
@@ -186,6 +187,72 @@ def test_a_full_disk_keeps_the_last_checkpoint(tmp_path: Path) -> None:
     assert train.main([str(path)]) == 0
 
 
+def test_a_full_disk_costs_lines_of_the_log_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    begin = train._Log.__init__
+
+    def full(self: Any, *arguments: Any) -> None:
+        begin(self, *arguments)
+        self.file.close()
+        self.file = open("/dev/full", "w")  # noqa: SIM115
+
+    monkeypatch.setattr(train._Log, "__init__", full)
+    assert train.main([str(make_config(tmp_path))]) == 0
+    said = capsys.readouterr().err
+    assert said.count("No space left") == 1
+    assert "it lacks lines from here on" in said
+    assert (tmp_path / "run/model.pt").exists()
+
+
+def test_a_run_goes_on_with_the_same_processes_and_held_out_data(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = make_config(tmp_path)
+    path.write_text(path.read_text().replace('[[check]]\nkind = "shards"\npath = "data"', '[[check]]\nkind = "shards"\npath = "more"'))
+    make_shards(tmp_path / "more", 2)
+    assert train.main([str(path)]) == 0
+    record = tmp_path / "run/run.json"
+    kept = record.read_text()
+    record.write_text(kept.replace('"processes": 1', '"processes": 2'))
+    assert train.main([str(path)]) == 1
+    assert "another processes" in capsys.readouterr().err
+    record.write_text(kept)
+    make_shards(tmp_path / "more", 3)
+    assert train.main([str(path)]) == 1
+    assert "another data hashes" in capsys.readouterr().err
+
+
+class Made:
+    """A dataset of made samples; those of `blank` have an empty truth."""
+
+    def __init__(self, count: int, blank: set[int]):
+        self.data = config.DataConfig("shards", "made")
+        self.count, self.blank = count, blank
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int) -> Sample:
+        one = sample(index, 40, 56, name=str(index))
+        return dataclasses.replace(one, truth=np.zeros_like(one.truth)) if index in self.blank else one
+
+
+def test_samples_without_truth_are_left_out_and_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    read = config.read(make_config(tmp_path, batch=3, steps=20))
+    drawn = [n for step in range(8) for n in batches.Batches([Made(6, {2, 5})], read)[step]["names"]]
+    again = batches.Batches([Made(6, {2, 5})], read)
+    assert [n for step in (7, 1) for n in again[step]["names"]] == drawn[21:24] + drawn[3:6]
+    assert set(drawn) == {"0", "1", "3", "4"}
+    whole = [n for step in range(8) for n in batches.Batches([Made(6, set())], read)[step]["names"]]
+    assert all(a == b for a, b in zip(whole, drawn, strict=True) if a not in "25"), "the others stay where they were"
+    assert "warning: 2: the true depth is empty" in capsys.readouterr().err
+    with pytest.raises(LabError, match="is empty, and so is that of 100 others"):
+        batches.Batches([Made(4, {0, 1, 2, 3})], read)[0]
+    of_holes = dataclasses.replace(read, model=config.ModelConfig(kind="hole", encoder="conv"))
+    assert "2" in [n for step in range(2) for n in batches.Batches([Made(6, {2})], of_holes)[step]["names"]]
+
+
 def test_what_cannot_be_trained_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def refused(path: Path, *words: str) -> None:
         assert train.main([str(path)]) == 1
@@ -194,6 +261,11 @@ def test_what_cannot_be_trained_is_refused(tmp_path: Path, capsys: pytest.Captur
             assert word in said
 
     refused(make_config(tmp_path, "big", crop=[48, 48]), "56x40 is smaller than the crop of 48x48")
+    path = make_config(tmp_path, "turned", flip=True)
+    path.write_text(path.read_text() + '[synthesis]\nsensor = "tof"\n')
+    refused(path, "raw depth of its own, whose holes have a side")
+    path.write_text(path.read_text().replace("flip = true", "").replace("width = 8", 'kind = "value"').replace("tof", "none"))
+    refused(path, "what measured raw depth")
     path = make_config(tmp_path, "gpu", device="cuda")
     if not torch.cuda.is_available():
         refused(path, "no GPU")
@@ -454,7 +526,8 @@ def test_each_kind_of_model_trains(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     path = make_config(tmp_path, steps=3, crop=[28, 42], rate=1e-3, head_rate=10.0)
     for i, (kind, more) in enumerate((("cdm", ""), ("hole", ""), ("value", ""), ("value", "refined_input = true\n"))):
         text = path.read_text().replace("[model]\nwidth = 8\n", f'[model]\nkind = "{kind}"\n{more}')
-        read = config.parse(text.replace("[train]\n", f"[train]\nbf16 = {str(i == 0).lower()}\n"))
+        text = text.replace("[train]\n", f"[train]\nbf16 = {str(i == 0).lower()}\n")
+        read = config.parse(text + '[synthesis]\nsensor = "stereo"\n')
         data = dataclasses.replace(read.data[0], path=str(tmp_path / "data"))
         folder = train.run(dataclasses.replace(read, folder=str(tmp_path / f"{i}"), data=(data,), check=(data,)))
         first = lines(folder)[0]

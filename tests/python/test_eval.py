@@ -156,6 +156,10 @@ def test_parts_are_one_run(binary: str, shards: Path, tmp_path: Path) -> None:
     run(binary, *arguments, "--max-m", 2, "--shard", "1/3", "--sums", other)
     said = run(binary, "--merge", parts[0], other, parts[2], codes=(2,)).stderr
     assert "two runs" in said and "range" in said
+    other.unlink()
+    run(binary, *arguments, "--scenes", "room,table", "--shard", "1/3", "--sums", other)
+    said = run(binary, "--merge", parts[0], other, parts[2], codes=(2,)).stderr
+    assert "two runs" in said and "--scenes room,table" in said
     said = run(binary, *arguments, "--shard", "1/3", "--sums", parts[0], codes=(2,)).stderr
     assert "other arguments" in said
     other.write_bytes(b"".join(parts[1].read_bytes().splitlines(keepends=True)[:-1]))

@@ -20,6 +20,7 @@ use depthrig_bus::Intrinsics;
 use depthrig_cdm::Precision;
 use depthrig_cdm::metrics::{DepthRange, Rules};
 use depthrig_convert::RunPart;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 mod source;
@@ -206,7 +207,11 @@ pub fn run(args: &EvalArgs, context: &Context) -> Result<Exit> {
     )?;
     let rows = refiners.rows(source.as_ref())?;
     let part = args.shard.unwrap_or(RunPart::ALL);
-    let header = Header::new(&title, part, rows, &rules, args.resize, source.left_out());
+    let header = Header {
+        resized: args.resize,
+        options: options(args),
+        ..Header::new(&title, part, rows, &rules, source.as_ref())
+    };
     let mut summary = Summary::new(rules);
     let mut pictures = Pictures::default();
     let run = Run {
@@ -228,6 +233,23 @@ pub fn run(args: &EvalArgs, context: &Context) -> Result<Exit> {
         return Ok(ended(&evaluation));
     }
     report(args, &outputs, &evaluation, &header, &pictures)
+}
+
+/// The options that decide what the numbers are, apart from those that the header has on its own.
+fn options(args: &EvalArgs) -> BTreeMap<String, String> {
+    // Without INPUT they are folders, which other computers may have elsewhere.
+    let stream = |name: &Option<String>| name.clone().filter(|_| args.input.is_some());
+    [
+        ("--unit", Some(args.unit.to_string())),
+        ("--truth-unit", args.truth_unit.map(|unit| unit.to_string())),
+        ("--scenes", Some(args.scenes.join(",")).filter(|scenes| !scenes.is_empty())),
+        ("--raw", stream(&args.raw)),
+        ("--truth", stream(&args.truth)),
+        ("--input-size", args.input_size.map(|pixels| pixels.to_string())),
+    ]
+    .into_iter()
+    .filter_map(|(name, value)| Some((name.to_owned(), value?)))
+    .collect()
 }
 
 /// Rules of the measurement.

@@ -141,10 +141,12 @@ impl Source for FromDataset {
         };
         let shared = Arc::clone(&self.shared);
         Some(Ok(Box::new(move || {
-            let mut cameras: Vec<&str> = shared.streams.iter().map(|(c, _)| c.as_str()).collect();
-            cameras.dedup();
             let mut images = Images::default();
-            for camera in cameras {
+            for (i, (camera, _)) in shared.streams.iter().enumerate() {
+                // Of a relabelled dataset the refined streams come after those of all cameras.
+                if shared.streams[..i].iter().any(|(earlier, _)| earlier == camera) {
+                    continue;
+                }
                 shared.of_camera(camera, set.id, &set.frames, &mut images)?;
             }
             Ok(images)

@@ -4,7 +4,7 @@
 //! being written has the ending `.part`; what a killed run left in it is kept but for a last, incomplete line. Sums are text
 //! with all their digits: what is read is what was written.
 
-use super::Place;
+use super::{Place, Source};
 use super::refine::RowInfo;
 use anyhow::{Context, Result, bail};
 use depthrig_bus::files::sync_folder_of;
@@ -17,7 +17,7 @@ use std::io::{BufRead, BufReader, BufWriter, ErrorKind, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 /// Version of the layout.
-const FORMAT: u32 = 1;
+const FORMAT: u32 = 2;
 
 /// Arguments of a run.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -40,20 +40,17 @@ pub struct Header {
     pub like_cdm: bool,
     /// Predictions of another size were resized.
     pub resized: bool,
+    /// Options that decide what the numbers are, by name.
+    pub options: BTreeMap<String, String>,
+    /// Jobs of all parts together.
+    pub images: u64,
     /// Omissions that were known from the start.
     pub left_out: Vec<String>,
 }
 
 impl Header {
-    /// Of a run.
-    pub fn new(
-        title: &str,
-        part: RunPart,
-        rows: Vec<RowInfo>,
-        rules: &Rules,
-        resized: bool,
-        left_out: Vec<String>,
-    ) -> Self {
+    /// Of a run of `rows` over `source`.
+    pub fn new(title: &str, part: RunPart, rows: Vec<RowInfo>, rules: &Rules, source: &dyn Source) -> Self {
         Self {
             format: FORMAT,
             program: format!("depthrig {}", env!("CARGO_PKG_VERSION")),
@@ -63,8 +60,10 @@ impl Header {
             metres: [rules.range.min_m, rules.range.max_m, rules.bin_m].map(|m| m.to_string()),
             bins: rules.bins,
             like_cdm: rules.skip_not_finite,
-            resized,
-            left_out,
+            resized: false,
+            options: BTreeMap::new(),
+            images: source.total(),
+            left_out: source.left_out(),
         }
     }
 
@@ -100,6 +99,8 @@ impl Header {
                 ("range and bins", format!("{} {}", h.metres.join(" "), h.bins)),
                 ("--like-cdm", h.like_cdm.to_string()),
                 ("--resize", h.resized.to_string()),
+                ("options", h.options.iter().map(|(k, v)| format!("{k} {v}")).collect::<Vec<_>>().join(", ")),
+                ("number of images", h.images.to_string()),
                 ("number of parts", h.part.parts().to_string()),
                 ("missing files", h.left_out.join("; ")),
             ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +20,10 @@ from .fill import filled_of
 from .sample import Sample
 from .synthesis import synthesise
 
-__all__ = ["Batches", "Example", "batch_of", "example", "loader", "raw_of", "seen_of"]
+__all__ = ["Batches", "Example", "batch_of", "check_use", "example", "is_blank", "loader", "raw_of", "seen_of"]
+
+ATTEMPTS = 100
+"""After so many samples in a row without true depth the dataset is refused."""
 
 Planes = dict[str, npt.NDArray[Any]]
 
@@ -56,6 +60,27 @@ def raw_of(sample: Sample, config: Config, rng: np.random.Generator) -> npt.NDAr
     return synthesise(sample.need_truth(), config.synthesis, rng)
 
 
+def needs_truth(config: Config) -> bool:
+    """Whether the model learns from true depth."""
+    return config.model.kind in ("tiny", "cdm") or config.model.refined_input
+
+
+def is_blank(sample: Sample) -> bool:
+    """Whether the true depth of a sample that has it is empty, as behind a covered lens."""
+    return sample.truth is not None and not sample.truth.any()
+
+
+def check_use(sample: Sample, config: Config, where: str) -> None:
+    """Refuse a dataset by its first sample.
+
+    :raises LabError: when the model needs true depth that it has not, or recorded depth would be mirrored.
+    """
+    if needs_truth(config) and sample.truth is None:
+        raise LabError(f"{where}: no true depth; it serves the hole and value models only")
+    if config.train.flip and sample.raw is not None:
+        raise LabError(f"{where}: it has raw depth of its own, whose holes have a side; leave flip out")
+
+
 def example(sample: Sample, config: Config, rng: np.random.Generator) -> Example:
     """Return one random crop of a sample, its colours changed a little.
 
@@ -65,8 +90,7 @@ def example(sample: Sample, config: Config, rng: np.random.Generator) -> Example
     if sample.color.shape[0] < height or sample.color.shape[1] < width:
         found = f"{sample.color.shape[1]}x{sample.color.shape[0]}"
         raise LabError(f"{sample.name}: {found} is smaller than the crop of {width}x{height}; choose a smaller crop")
-    needs_truth = config.model.kind in ("tiny", "cdm") or config.model.refined_input
-    truth = sample.need_truth() if needs_truth else sample.truth
+    truth = sample.need_truth() if needs_truth(config) else sample.truth
     raw = raw_of(sample, config, rng)
     y = int(rng.integers(sample.color.shape[0] - height + 1))
     x = int(rng.integers(sample.color.shape[1] - width + 1))
@@ -103,6 +127,7 @@ class Batches(Dataset):  # type: ignore[type-arg,unused-ignore]
         self.world = world
         self.counts = [max(1, round(len(s) * s.data.weight)) for s in sources]
         self.ends = np.cumsum(self.counts)
+        self._blank: set[str] = set()
         self._order: tuple[int, npt.NDArray[np.int64]] = (-1, np.zeros(0, np.int64))
 
     def _sample(self, position: int) -> Sample:
@@ -125,8 +150,22 @@ class Batches(Dataset):  # type: ignore[type-arg,unused-ignore]
         examples = []
         for position in range(first, first + size):
             rng = np.random.default_rng([self.config.seed, 2, position])
-            examples.append(example(self._sample(position), self.config, rng))
+            examples.append(example(self._with_truth(position), self.config, rng))
         return batch_of(examples)
+
+    def _with_truth(self, position: int) -> Sample:
+        """The sample of a position, or where its true depth is empty and the model needs it, another that is drawn."""
+        sample = self._sample(position)
+        rng = np.random.default_rng([self.config.seed, 5, position])
+        for _ in range(ATTEMPTS):
+            if not (needs_truth(self.config) and is_blank(sample)):
+                return sample
+            if sample.name not in self._blank:
+                self._blank.add(sample.name)
+                said = f"warning: {sample.name}: the true depth is empty; others are drawn in its place"
+                print(said, file=sys.stderr, flush=True)
+            sample = self._sample(position - position % int(self.ends[-1]) + int(rng.integers(int(self.ends[-1]))))
+        raise LabError(f"{sample.name}: the true depth is empty, and so is that of {ATTEMPTS} others that were drawn")
 
 
 def loader(batches: Batches, first_step: int) -> Any:

@@ -82,7 +82,7 @@ class SynthesisConfig:
     """Raw depth made from true depth, for datasets without a sensor."""
 
     sensor: str = "none"
-    """`none` (raw depth as the dataset has it), `stereo` or `tof`."""
+    """`stereo` or `tof`, or `none`: raw depth as the dataset has it. A `value` model needs to know what measured it."""
     focal_baseline: float = 30.0
     """Focal length times baseline of the stereo sensor, pixels times metres, at a width of 640."""
     value: str | None = None
@@ -138,7 +138,7 @@ class TrainConfig:
     crop: tuple[int, int] = (192, 256)
     """Height and width of the crop; multiples of 16 for `tiny`, any for `conv`, of 14 for the others."""
     flip: bool = False
-    """Mirrored images half of the time. Refused for stereo: what is hidden lies left of things."""
+    """Mirrored images half of the time, of ToF depth that is made here. What stereo misses lies left of things."""
     color_jitter: float = 0.2
     rate: float = 2.5e-3
     head_rate: float = 1.0
@@ -202,6 +202,8 @@ class Config:
         if not self.data:
             raise LabError("there is no [[data]]; name at least one dataset")
         _within("seed", self.seed, 0, 2**63 - 1)
+        if self.model.kind == "value" and self.synthesis.sensor == "none":
+            raise LabError('kind = "value" needs sensor = "stereo" or "tof" under [synthesis]: what measured raw depth')
         of_vit = 1 if self.model.encoder == "conv" else 14
         multiple = 16 if self.model.kind == "tiny" else of_vit
         if any(side % multiple for side in self.train.crop):

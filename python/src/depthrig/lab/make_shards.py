@@ -7,6 +7,8 @@ of each other: `--shard K/N` makes every N-th, a complete one is left as it is, 
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,6 +26,7 @@ from .losses import inverse
 from .nets import NoiseConv, NoiseNet, load_weights, noise_net
 from .nets.cdm import normalise_color
 from .nets.vit import PATCH
+from .record import fingerprint, keep
 from .sample import Sample, check_licences
 from .shards import ShardWriter, part_of, write_description
 from .synthesis import synthesise
@@ -40,6 +43,7 @@ class NoiseModels:
     def __init__(self, config: Config):
         self.refined_input = config.model.refined_input
         self.value = self._open(config, config.synthesis.value)
+        _check_measure(config)
         self.hole = self._open(config, config.synthesis.hole)
 
     @staticmethod
@@ -78,6 +82,25 @@ class NoiseModels:
         return value, hole
 
 
+def _check_measure(config: Config) -> None:
+    """Refuse a value model of the other kind of sensor: it says depth (ToF) or inverse depth (stereo).
+
+    Known where the model lies in the folder of its run.
+    """
+    run = Path(config.synthesis.value).with_name("run.json") if config.synthesis.value else None
+    if run is None or not run.is_file():
+        return
+    try:
+        sensor = str(json.loads(run.read_text())["config"]["synthesis"]["sensor"])
+    except (OSError, ValueError, KeyError, TypeError) as e:
+        raise LabError(f"{run}: not the record of a run ({e})") from None
+    if (sensor == "tof") != (config.synthesis.sensor == "tof"):
+        raise LabError(
+            f'{run}: the value model learned from sensor = "{sensor}", and these shards are of '
+            f'sensor = "{config.synthesis.sensor}"; train one of that kind'
+        )
+
+
 def _usable(sample: Sample) -> bool:
     """Whether a shard can hold it: a pinhole camera and some truth."""
     return sample.intrinsics is not None and sample.truth is not None and bool(sample.truth.any())
@@ -92,8 +115,11 @@ def make(config: Config, out: Path, part: tuple[int, int] = (0, 1), per_shard: i
         raise LabError('no sensor to make raw depth of; set sensor = "stereo" or "tof" under [synthesis]')
     sources = [open_source(d) for d in config.data]
     check_licences({f"{s.data.kind} {s.root}": s.licence for s in sources}, config.ships)
+    if len(licences := sorted({s.licence.name for s in sources})) > 1:
+        raise LabError(f"shards have one licence, and these data have {', '.join(licences)}; make a folder of each")
     models = NoiseModels(config)
     out.mkdir(parents=True, exist_ok=True)
+    _agree(config, out, sources, per_shard)
     total = sum(len(s) for s in sources)
     left_out = 0
     for shard in range(part[0], -(-total // per_shard), part[1]):
@@ -106,6 +132,18 @@ def make(config: Config, out: Path, part: tuple[int, int] = (0, 1), per_shard: i
     arguments = {"data": [d.path for d in config.data], "seed": config.seed, "sensor": config.synthesis.sensor}
     write_description(out, config.name, "lab", arguments, total)
     return left_out
+
+
+def _agree(config: Config, out: Path, sources: Sequence[Source], per_shard: int) -> None:
+    """Write into the folder what its shards are made of, or refuse one that holds others; places are no part of it."""
+    synthesis = dataclasses.replace(config.synthesis, value=None, hole=None)
+    model = dataclasses.replace(config.model, weights=None)
+    made_by = {"synthesis": dataclasses.asdict(synthesis), "model": dataclasses.asdict(model)}
+    data = {f"{i} {s.data.kind}": fingerprint(s.files(), s.root) for i, s in enumerate(sources)}
+    for what, path in (("value", config.synthesis.value), ("hole", config.synthesis.hole)):
+        if path is not None:
+            data[what] = fingerprint([Path(path)], Path(path).parent)
+    keep(out, {"name": config.name, "seed": config.seed, "per shard": per_shard, **made_by}, data)
 
 
 def _fill(writer: ShardWriter, sources: Sequence[Source], numbers: range, config: Config, models: NoiseModels) -> int:

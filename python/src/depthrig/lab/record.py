@@ -32,7 +32,8 @@ def fsync_folder(folder: Path) -> None:
 
 def write_atomically(path: Path, data: bytes) -> None:
     """Write a file so that it is complete or as it was before, also after a crash or on a full disk."""
-    part = path.with_name(f".{path.name}.tmp")
+    # Of this process: the parts of a run write one file with the same content.
+    part = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with part.open("wb") as f:
             f.write(data)

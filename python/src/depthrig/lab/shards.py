@@ -9,6 +9,7 @@ A file with its final name ends in the two zero blocks of tar; one that does not
 from __future__ import annotations
 
 import dataclasses
+import fcntl
 import json
 import os
 import re
@@ -202,14 +203,40 @@ def to_units(depth: npt.NDArray[np.float32], unit_m: float) -> npt.NDArray[np.ui
     return np.where((units >= 1) & (units <= 65535), units, 0).astype(np.uint16)
 
 
+def _open_part(path: Path) -> BinaryIO:
+    """Open the file of a shard that is being written, emptied and locked.
+
+    :raises LabError: while another process writes it.
+    """
+    while True:
+        file = path.open("ab")
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.close()
+            raise LabError(f"{path}: another process writes this shard; give each its own --shard") from None
+        except OSError:
+            pass  # some network file systems have no locks
+        # Between opening and locking another process may have completed it and given it its name.
+        try:
+            named = os.stat(path)
+        except FileNotFoundError:
+            named = None
+        if named is not None and os.path.samestat(os.fstat(file.fileno()), named):
+            file.truncate(0)
+            return file
+        file.close()
+
+
 class ShardWriter:
-    """Writes one shard: ``.tar.part`` until `close`, then synced and renamed. An exception leaves no file behind."""
+    """Writes one shard: ``.tar.part`` until `close`, then synced and renamed. An exception leaves no file behind, and so does
+    a shard without samples."""
 
     def __init__(self, path: Path):
         self.path = path
         self.part = path.with_name(path.name + ".part")
         self.count = 0
-        self._file = self.part.open("wb")
+        self._file = _open_part(self.part)
 
     def __enter__(self) -> ShardWriter:
         return self
@@ -217,11 +244,12 @@ class ShardWriter:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is None:
+        if kind is None and self.count:
             self.close()
         else:
-            self._file.close()
+            # Removed before it is unlocked.
             self.part.unlink(missing_ok=True)
+            self._file.close()
 
     def _member(self, name: str, data: bytes) -> None:
         info = tarfile.TarInfo(name)
@@ -258,8 +286,9 @@ class ShardWriter:
         self._file.write(bytes(2 * BLOCK))
         self._file.flush()
         os.fsync(self._file.fileno())
-        self._file.close()
+        # Named before it is unlocked.
         self.part.replace(self.path)
+        self._file.close()
         fsync_folder(self.path.parent)
 
 

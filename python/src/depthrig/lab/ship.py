@@ -95,7 +95,7 @@ def record(config: Config, run: dict[str, Any], found: dict[str, Any], gates: di
             hashed = next((h for name, h in run["data"].items() if name.endswith(f" {path}")), None)
             lines += _table(f"{of}.{_key(path.name)}", {"sha256": hashed, **_arguments(path)})
     train = dict(run["config"]["train"])
-    lines += _table("train", {"seed": config.seed, **train})
+    lines += _table("train", {"seed": config.seed, "processes": run["config"]["processes"], **train})
     lines += _table("versions", run["versions"])
     return "\n".join(lines) + "\n"
 

@@ -14,6 +14,7 @@ import json
 import math
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 from . import checkpoint, losses, metrics
-from .batches import Batches, loader, raw_of
+from .batches import Batches, check_use, is_blank, loader, raw_of
 from .config import Config, DataConfig, read
 from .data import Source, open_source
 from .errors import LabError, first_line
@@ -219,6 +220,9 @@ class _Trainer:
 
     def _measure(self, source: Source, index: int, of: dict[str, list[metrics.Measured]]) -> None:
         sample = source[index]
+        if is_blank(sample):
+            print(f"warning: {sample.name}: the true depth is empty; it is left out", file=sys.stderr, flush=True)
+            return
         raw = raw_of(sample, self.config, np.random.default_rng([self.config.seed, 3, index]))
         multiple = 16 if self.config.model.kind == "tiny" else 14
         height, width = (side // multiple * multiple for side in raw.shape)
@@ -269,7 +273,8 @@ class _Log:
         lines = path.read_text().splitlines(keepends=True) if path.exists() else []
         # What came after the checkpoint is done again.
         write_atomically(path, "".join(lines[:step]).encode())
-        self.file = path.open("a")
+        self.path, self.file = path, path.open("a")
+        self.is_full = False
         self.board: Any = None
         self.bar: Any = None
         try:
@@ -286,8 +291,7 @@ class _Log:
             pass
 
     def write(self, numbers: dict[str, float]) -> None:
-        self.file.write(json.dumps(numbers) + "\n")
-        self.file.flush()
+        self._kept(lambda: self.file.write(json.dumps(numbers) + "\n"), self.file.flush)
         if self.board is not None:
             for name in ("loss", "rate", "gradient"):
                 self.board.add_scalar(name, numbers[name], numbers["step"])
@@ -295,11 +299,21 @@ class _Log:
             self.bar.update()
             self.bar.set_postfix(loss=f"{numbers['loss']:.4f}")
 
+    def _kept(self, *steps: Callable[[], object]) -> None:
+        """Run `steps`; a full disk costs lines and not the run."""
+        try:
+            for step in steps:
+                step()
+        except OSError as e:
+            if not self.is_full:
+                print(f"warning: {self.path}: {e}; it lacks lines from here on", file=sys.stderr, flush=True)
+            self.is_full = True
+
     def close(self) -> None:
-        self.file.close()
+        self._kept(self.file.close)
         for each in (self.board, self.bar):
             if each is not None:
-                each.close()
+                self._kept(each.close)
 
 
 def run(config: Config) -> Path:
@@ -316,6 +330,8 @@ def run(config: Config) -> Path:
     sources, held_out = open_all(config.data), open_all(config.check)
     licences = {f"{s.data.kind} {s.root}": s.licence for s in sources}
     check_licences(licences, config.ships, say=print if rank == 0 else lambda _: None)
+    for source in (*sources, *held_out):
+        check_use(source[0], config, str(source.root))
     if config.train.device == "cpu":
         # One thread per process: sums have one order, and OpenMP's threads only wait for each other.
         torch.set_num_threads(1)
@@ -323,9 +339,10 @@ def run(config: Config) -> Path:
         dist.init_process_group("gloo" if config.train.device == "cpu" else "nccl")
     try:
         if rank == 0:
-            # Where a run lies is not a part of it.
-            plain = dataclasses.asdict(config) | {"folder": ""}
-            keep(folder, plain, {f"{s.data.kind} {s.root}": fingerprint(s.files(), s.root) for s in sources})
+            # Where a run lies is not a part of it; how many share a step is.
+            plain = dataclasses.asdict(config) | {"folder": "", "processes": world}
+            every = (*sources, *held_out)
+            keep(folder, plain, {f"{s.data.kind} {s.root}": fingerprint(s.files(), s.root) for s in every})
         if world > 1:
             dist.barrier()
         trainer = _Trainer(config, folder, sources, held_out)
@@ -345,7 +362,7 @@ def main(arguments: list[str] | None = None) -> int:
     parsed = parser.parse_args(arguments)
     try:
         print(f"complete: {run(read(parsed.config))}")
-    except LabError as e:
+    except (LabError, OSError) as e:
         print(f"error: {e}", file=sys.stderr)
         return 1
     return 0

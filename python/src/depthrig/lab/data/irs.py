@@ -20,23 +20,25 @@ BASELINE_M = 0.1
 
 
 class Irs(Source):
-    """The lines of `lists/*SPLIT*.list`: left image, right image, disparity, normals, relative to the folder."""
+    """The lines of `lists/irs_SPLIT.list`: left image, right image, disparity, normals, relative to the folder.
+
+    The other lists there are parts of that one, or of another layout.
+    """
 
     licence = Licence("Apache-2.0", ships=True)
 
     def __init__(self, data: DataConfig):
         super().__init__(data)
         self.splits("train", "test")
-        lists = sorted(p for p in (self.root / "lists").glob("*.list") if data.split in p.name.lower())
+        path = self.root / f"lists/irs_{data.split}.list"
         self.pairs: list[tuple[str, str]] = []
-        for path in lists:
-            for number, line in enumerate(path.read_text().splitlines(), 1):
-                words = line.split()
-                if len(words) >= 3:
-                    self.pairs.append((words[0], words[2]))
-                elif words:
-                    raise LabError(f"{path}: line {number} is not LEFT RIGHT DISPARITY NORMAL")
-        self.found(len(self.pairs), f"lists/*{data.split}*.list with lines")
+        for number, line in enumerate(path.read_text().splitlines() if path.is_file() else [], 1):
+            words = line.split()
+            if len(words) >= 3:
+                self.pairs.append((words[0], words[2]))
+            elif words:
+                raise LabError(f"{path}: line {number} is not LEFT RIGHT DISPARITY NORMAL")
+        self.found(len(self.pairs), f"lists/{path.name} with lines")
 
     def __len__(self) -> int:
         return len(self.pairs)
