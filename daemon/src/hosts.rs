@@ -49,8 +49,8 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 
-/// Makes one dataset of others ([`crate::joining`]).
-pub type JoinParts = fn(&[PathBuf], &Path, &RuntimeDir, &AtomicBool) -> Result<u64>;
+/// Makes one dataset of others ([`crate::joining`]), and leaves so many bytes free on the disk.
+pub type JoinParts = fn(&[PathBuf], &Path, &RuntimeDir, u64, &AtomicBool) -> Result<u64>;
 
 /// The folder of the channels over which parts are joined, below that of the user's rigs.
 pub const JOINING: &str = "joining";
@@ -90,7 +90,7 @@ pub struct Hosts {
     rig: RigName,
     /// Cameras of this computer.
     cameras: Vec<String>,
-    /// Room that pulled parts leave on the disk.
+    /// Room that pulled parts and joined datasets leave on the disk.
     reserve_bytes: u64,
     join: Option<JoinParts>,
     grid: Arc<Grid>,
@@ -260,6 +260,9 @@ impl Hosts {
             if host.is_connected() {
                 // By what was seen last: the next answer may come late, behind what is pulled.
                 self.visit(host, &client, may_begin);
+            } else {
+                // One that is refused has nothing to begin, and may have a part to end.
+                self.end_part(host, &client);
             }
             let looked = client.status();
             let is_new = self.note(host, looked.as_ref(), tunnel.as_ref());
@@ -341,7 +344,9 @@ impl Hosts {
                 seen.streaming = status.cameras.iter().filter(|c| c.state == CameraState::Streaming).count();
                 seen.has_clock = status.link.as_ref().is_some_and(|link| link.offset_s.is_some());
                 seen.recording = status.recording.as_ref().filter(|r| r.active).map(|r| r.name.clone());
-                lock(&host.cameras).clone_from(&status.cameras);
+                if seen.state == HostState::Connected {
+                    lock(&host.cameras).clone_from(&status.cameras);
+                }
             }
             Err(e) => {
                 seen.state = HostState::Absent;
@@ -377,7 +382,8 @@ impl Hosts {
         let twice = |is_taken: &dyn Fn(&String) -> bool| {
             status.cameras.iter().map(|camera| &camera.name).find(|name| is_taken(name)).cloned()
         };
-        let others = self.others.iter().filter(|other| other.config.name != *name);
+        // Cameras of one that is away may have moved to another.
+        let others = self.others.iter().filter(|other| other.config.name != *name && other.is_connected());
         let here = twice(&|name| self.cameras.contains(name)).map(|c| (c, "this computer".to_owned()));
         let shared = here.or_else(|| {
             others.into_iter().find_map(|o| {
@@ -410,7 +416,7 @@ impl Hosts {
             lock(&self.sessions).joined(&session.name, JoinState::Joining, None);
             let inputs: Vec<_> =
                 core::iter::once(session.folder.clone()).chain(session.part_folders()).collect();
-            let ended = join(&inputs, &out, &self.runtime, stop);
+            let ended = join(&inputs, &out, &self.runtime, self.reserve_bytes, stop);
             if stop.load(Ordering::Relaxed) {
                 return;
             }

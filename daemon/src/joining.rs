@@ -7,7 +7,7 @@
 use crate::config::RecordingConfig;
 use crate::control::RecordRequest;
 use crate::hosts::JOINING;
-use crate::recording::reserve_bytes;
+use crate::recording;
 use crate::replay::{Replay, ReplayOptions};
 use crate::{Error, ErrorKind, Result};
 use core::ops::ControlFlow;
@@ -27,12 +27,18 @@ const FOLDER: &str = ".joining";
 const LOOK: Duration = Duration::from_millis(100);
 
 /// Joins `parts`, that of the computer whose clock is the session's first, into the new dataset `out`; the number of its sets. Its name, scene,
-/// notes and episodes are those of the first part. The parts stay as they are.
+/// notes and episodes are those of the first part. The parts stay as they are, and `reserve_bytes` stay free on the disk.
 ///
 /// # Errors
-/// `InUse` when `out` exists or another session is being joined, `BadInput` when the parts do not belong together, `NoSpace`, and `Other` when it was
-/// stopped, or when the result is not what it should be; `out` does not exist then.
-pub fn join(parts: &[PathBuf], out: &Path, runtime: &RuntimeDir, stop: &AtomicBool) -> Result<u64> {
+/// `InUse` when `out` exists or another session is being joined, `BadInput` when the parts do not belong together or one has no clock of the session,
+/// `NoSpace`, and `Other` when it was stopped, or when the result is not what it should be; `out` does not exist then.
+pub fn join(
+    parts: &[PathBuf],
+    out: &Path,
+    runtime: &RuntimeDir,
+    reserve_bytes: u64,
+    stop: &AtomicBool,
+) -> Result<u64> {
     if out.symlink_metadata().is_ok() {
         let what = format!("{} exists; a joined dataset is a new one", out.display());
         return Err(Error::new(ErrorKind::InUse, what));
@@ -55,18 +61,20 @@ pub fn join(parts: &[PathBuf], out: &Path, runtime: &RuntimeDir, stop: &AtomicBo
         Error::new(ErrorKind::Other, format!("{}: {e}", path.display())).with_source(e)
     };
     umask::create_dir_all(&hidden).map_err(|e| failed(&hidden, e))?;
-    must_fit(parts, &hidden)?;
+    must_fit(parts, &hidden, reserve_bytes)?;
     let growing = hidden.join(name);
     let options = ReplayOptions {
         as_fast_as_possible: true,
         in_background: true,
+        by_utc: false,
         paused: true,
         ..ReplayOptions::default()
     };
     // It takes the lock of the channels: what lies in the hidden folder is nobody's.
     let replay = Replay::start(parts, &channels, None, options)?;
-    let recorded =
-        remove(&growing).map_err(|e| failed(&growing, e)).and_then(|()| record(replay, &hidden, name, stop));
+    let recorded = remove(&growing)
+        .map_err(|e| failed(&growing, e))
+        .and_then(|()| record(replay, &hidden, name, reserve_bytes, stop));
     let checked = recorded.and_then(|()| {
         adopt(&RealFs, &growing, Dataset::open(first)?.session())?;
         check(parts, &growing, stop)
@@ -88,8 +96,9 @@ fn has_sets(part: &Path) -> bool {
 }
 
 /// The result is about as large as its parts; recordings must find room after it.
-fn must_fit(parts: &[PathBuf], folder: &Path) -> Result<()> {
-    let mut needed = reserve_bytes(&RecordingConfig::default());
+fn must_fit(parts: &[PathBuf], folder: &Path, reserve_bytes: u64) -> Result<()> {
+    // The recorder of a replay leaves the default.
+    let mut needed = reserve_bytes.max(recording::reserve_bytes(&RecordingConfig::default()));
     for part in parts {
         needed = needed.saturating_add(Dataset::open(part)?.info()?.bytes);
     }
@@ -97,13 +106,17 @@ fn must_fit(parts: &[PathBuf], folder: &Path) -> Result<()> {
     if free >= needed {
         return Ok(());
     }
+    Err(no_space(folder, free, needed))
+}
+
+fn no_space(folder: &Path, free: u64, needed: u64) -> Error {
     let what = format!(
         "{} has {} MB free, and {} MB are needed to join the parts and to record after that; make room, then call depthrig merge --hosts",
         folder.display(),
         free / 1_000_000,
         needed / 1_000_000
     );
-    Err(Error::new(ErrorKind::NoSpace, what))
+    Error::new(ErrorKind::NoSpace, what)
 }
 
 fn remove(folder: &Path) -> std::io::Result<()> {
@@ -114,7 +127,7 @@ fn remove(folder: &Path) -> std::io::Result<()> {
 }
 
 /// Records the replay to its end.
-fn record(replay: Replay, directory: &Path, name: &str, stop: &AtomicBool) -> Result<()> {
+fn record(replay: Replay, directory: &Path, name: &str, reserve_bytes: u64, stop: &AtomicBool) -> Result<()> {
     let control = replay.control();
     // Its size was held against the disk; how fast a replay writes says nothing about how long the disk lasts.
     let request = RecordRequest {
@@ -130,6 +143,11 @@ fn record(replay: Replay, directory: &Path, name: &str, stop: &AtomicBool) -> Re
     while !replay.wait(LOOK) {
         if stop.load(Ordering::Relaxed) {
             return Err(stopped());
+        }
+        // A recording that began meanwhile comes first.
+        let free = shm::free_bytes(directory)?;
+        if free < reserve_bytes {
+            return Err(no_space(directory, free, reserve_bytes));
         }
     }
     let summary = replay.stop();

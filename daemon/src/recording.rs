@@ -137,7 +137,8 @@ impl Begun {
             ));
         }
         let utc = (outside.utc)();
-        let (name, path) = place(&config.recording, request, utc.utc_ns)?;
+        let hosts = config.link.as_ref().map_or(&[][..], |link| &link.hosts);
+        let (name, path) = place(&config.recording, hosts, request, utc.utc_ns)?;
         let mut session = Session::new(&name, config.rig.as_str());
         session.scene.clone_from(&request.scene);
         session.operator.clone_from(&request.operator);

@@ -82,6 +82,8 @@ pub struct ReplayOptions {
     pub hold: bool,
     /// Refine the depth of its cameras with this engine, as a rig does; not with `as_fast_as_possible`.
     pub refine: Option<EngineChoice>,
+    /// Several datasets that have no clock of one session are matched by UTC; without this they are refused.
+    pub by_utc: bool,
     /// Give way to everything else: threads of low priority, and the least shared memory.
     pub in_background: bool,
     /// Whether to serve the control API.
@@ -101,6 +103,7 @@ impl Default for ReplayOptions {
             paused: false,
             hold: false,
             refine: None,
+            by_utc: true,
             in_background: false,
             serve_api: false,
             foxglove: Port::Off,
@@ -205,7 +208,7 @@ impl Replay {
                  others are skipped; leave out one of the two (depthrig cdm relabel refines every frame)",
             ));
         }
-        let mut sources = Sources::open(datasets, rig)?;
+        let mut sources = Sources::open(datasets, rig, options.by_utc)?;
         let timeline = Arc::new(part(&sources.timeline()?, &options)?);
         let config = recording_config(&mut sources);
         let rig = config.rig.clone();

@@ -19,6 +19,9 @@ use std::sync::{Arc, Mutex};
 const EVERY: Duration = Duration::from_millis(50);
 /// Questions whose answers may still come: two seconds.
 const OUTSTANDING: usize = 40;
+/// After so long without a packet the socket is made anew: it keeps the address of this computer that it began with, which another one may have
+/// replaced.
+const SILENT: Duration = Duration::from_secs(2);
 
 /// State of the exchange with the other host.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
@@ -71,6 +74,7 @@ impl Asker {
         let asking = Asking {
             address,
             socket: None,
+            heard: HostTime::now(),
             random,
             outstanding: VecDeque::new(),
             corridor: Corridor::default(),
@@ -106,6 +110,8 @@ struct Asking {
     address: SocketAddr,
     /// None until there is a route to the host.
     socket: Option<Stamped>,
+    /// When the last packet came, or the socket was made.
+    heard: HostTime,
     random: File,
     /// Questions without an answer, and when they were sent.
     outstanding: VecDeque<([u8; 16], HostTime)>,
@@ -126,13 +132,15 @@ impl Asking {
     }
 
     fn ask(&mut self) -> io::Result<()> {
-        let socket = match self.socket.take() {
-            Some(socket) => socket,
-            None => connected(self.address)?,
-        };
-        let socket = self.socket.insert(socket).socket();
         let mut nonce = [0; 16];
         self.random.read_exact(&mut nonce)?;
+        let kept = self.socket.take().filter(|_| self.heard.elapsed() < SILENT);
+        let socket = if let Some(socket) = kept {
+            socket
+        } else {
+            self.heard = HostTime::now();
+            connected(self.address)?
+        };
         if self.outstanding.len() == OUTSTANDING {
             self.outstanding.pop_front();
         }
@@ -142,7 +150,10 @@ impl Asking {
         drop(shared);
         let sent = HostTime::now();
         self.outstanding.push_back((nonce, sent));
-        socket.send(&question).map(drop)
+        // One that cannot send is not kept.
+        socket.socket().send(&question)?;
+        self.socket = Some(socket);
+        Ok(())
     }
 
     /// Waits for a packet until it is time for the next question; `false` when it is.
@@ -157,7 +168,10 @@ impl Asking {
             None => Err(io::ErrorKind::NotConnected.into()),
         };
         let received = match received {
-            Ok(Some(received)) => received,
+            Ok(Some(received)) => {
+                self.heard = received.at;
+                received
+            }
             Ok(None) => return false,
             Err(_) => {
                 // The host cannot be reached, or nobody listens there yet.
@@ -272,6 +286,21 @@ mod tests {
         let asker = Asker::start("[2001:db8::1]:7447".parse().unwrap(), Trust::Anyone).unwrap();
         std::thread::sleep(Duration::from_millis(300));
         assert_eq!(asker.at(HostTime::now()), None);
+    }
+
+    #[test]
+    fn silence_is_asked_from_another_socket() {
+        let host = UdpSocket::bind("127.0.0.1:0").unwrap();
+        host.set_read_timeout(Some(Duration::from_secs(30))).unwrap();
+        let asker = Asker::start(host.local_addr().unwrap(), Trust::Anyone).unwrap();
+        let began = HostTime::now();
+        let mut from =
+            |n: usize| (0..n).map(|_| host.recv_from(&mut [0; 100]).unwrap().1).collect::<Vec<_>>();
+        let first = from(1)[0];
+        while from(1)[0] == first {
+            assert!(began.elapsed() < Duration::from_secs(60), "the same socket for ever");
+        }
+        assert!(began.elapsed() >= SILENT && asker.state().answered == 0);
     }
 
     #[test]

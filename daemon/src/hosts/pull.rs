@@ -38,6 +38,11 @@ pub(super) struct Pull<'a> {
     pub(super) stop: &'a AtomicBool,
 }
 
+/// Where the copy grows of a part that is to be `folder`.
+pub(super) fn growing(folder: &Path) -> PathBuf {
+    folder.with_file_name(FOLDER).join(folder.file_name().unwrap_or_default())
+}
+
 /// Bytes of the next piece after one of `bytes` that took so long.
 fn next_piece(bytes: u64, took: Duration) -> u64 {
     let next = if took < PIECE_TIME / 2 {
@@ -78,7 +83,7 @@ impl Pull<'_> {
         let turn = asked.elapsed();
         let (segments, session): (Vec<_>, Vec<_>) =
             listed.files.into_iter().partition(|file| file.file != SESSION_FILE);
-        let folder = self.growing();
+        let folder = growing(&self.folder);
         let failed = |e: io::Error| self.failed(&folder, &e);
         umask::create_dir_all(&folder).map_err(failed)?;
         let mut pulled = Pulled { bytes: segments.iter().map(|s| s.bytes).sum(), ..Pulled::default() };
@@ -109,10 +114,6 @@ impl Pull<'_> {
             tracing::debug!("{counted} segments of {}", self.name);
         }
         Ok(pulled)
-    }
-
-    fn growing(&self) -> PathBuf {
-        self.folder.with_file_name(FOLDER).join(self.name)
     }
 
     fn is_over(&self) -> bool {

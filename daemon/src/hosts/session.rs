@@ -48,6 +48,8 @@ pub(super) struct Part {
     pub(super) bytes: u64,
     pub(super) pulled_bytes: u64,
     pub(super) why: Option<String>,
+    /// When it was asked for, or read from the file.
+    pub(super) since: HostTime,
 }
 
 /// The contents of [`FILE`].
@@ -148,6 +150,7 @@ impl Session {
             bytes: 0,
             pulled_bytes: 0,
             why: None,
+            since: HostTime::now(),
         };
         Some(Self {
             name: folder.file_name()?.to_str()?.to_owned(),
@@ -258,7 +261,7 @@ impl Sessions {
 
     /// Whether a recording of this name is a part of one that has ended.
     pub(super) fn is_over(&self, part: &str) -> bool {
-        let of = self.0.iter().find(|session| session.parts.iter().any(|p| p.name == part));
+        let of = self.0.iter().rfind(|session| session.parts.iter().any(|p| p.name == part));
         of.is_some_and(|session| !session.goes_on)
     }
 
@@ -272,6 +275,7 @@ impl Sessions {
             bytes: 0,
             pulled_bytes: 0,
             why: None,
+            since: HostTime::now(),
         });
         session.excuses.remove(host);
         session.keep();

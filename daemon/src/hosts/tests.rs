@@ -1,11 +1,11 @@
-use super::Hosts;
 use super::pull::{Pull, Pulled};
 use super::session::Sessions;
+use super::{Hosts, lock};
 use crate::api::{self, ServerHandle};
 use crate::client::Client;
 use crate::config::{ControlConfig, RigConfig};
 use crate::control::{Control, EpisodeRequest, RecordRequest};
-use crate::status::{JoinState, RecordingStatus, RigStatus};
+use crate::status::{CameraStatus, HostState, JoinState, LinkState, LinkStatus, RecordingStatus, RigStatus};
 use crate::{Error, ErrorKind, Result};
 use depthrig_bus::runtime::RigLock;
 use depthrig_bus::{HostTime, Name, RigName, RuntimeDir};
@@ -361,6 +361,92 @@ fn a_recording_that_ends_by_itself_ends_its_parts() {
     sessions.follow(None);
     assert!(sessions.is_over("one_left"));
     assert!(!sessions.is_over("two_left"), "whatever else a host records is its own");
+}
+
+const THREE: &str = "rig = \"mount\"\n[link]\nhost = \"right\"\nlisten = \"127.0.0.1:7447\"\n[[link.hosts]]\nname = \"left\"\n\
+                     socket = \"/left.sock\"\n[[link.hosts]]\nname = \"top\"\nsocket = \"/top.sock\"\n\
+                     [[camera]]\nname = \"a\"\nbackend = \"synthetic\"\nmodel = \"generic\"\n";
+
+/// This computer, and two others that are not asked.
+fn three(tmp: &Path) -> Hosts {
+    let runtime = RuntimeDir::at(&tmp.join("r")).unwrap();
+    let config = RigConfig::parse(THREE, None).unwrap();
+    Hosts::new(&config, &runtime, None, Arc::default(), None).unwrap().unwrap()
+}
+
+/// What a daemon says that calls itself `host` and has `camera`.
+fn said_by(host: &str, camera: &str) -> RigStatus {
+    let link = LinkStatus {
+        host: host.to_owned(),
+        insecure: true,
+        recorder: Some("127.0.0.1:7447".to_owned()),
+        state: LinkState::Live,
+        offset_s: Some(0.0),
+        uncertainty_us: Some(10.0),
+        rate_ppm: Some(0.0),
+        epoch: Some(1),
+        round_trip_us: Some(20.0),
+        age_s: Some(0.0),
+        exchanges: 1,
+        refused: 0,
+    };
+    let camera = CameraStatus { name: camera.to_owned(), ..CameraStatus::default() };
+    RigStatus { rig: "mount".to_owned(), link: Some(link), cameras: vec![camera], ..RigStatus::default() }
+}
+
+#[test]
+fn a_computer_is_refused_for_cameras_of_those_that_are_part_of_the_rig_alone() {
+    let tmp = tempfile::Builder::new().prefix("dh").rand_bytes(4).tempdir_in("/tmp").unwrap();
+    let hosts = three(tmp.path());
+    let state = |number: usize, looked: Result<&RigStatus, &Error>| {
+        let host = &hosts.others[number];
+        hosts.note(host, looked, None);
+        let seen = host.status();
+        (seen.state, seen.why.unwrap_or_default())
+    };
+    let left = said_by("left", "wrist");
+    assert_eq!(state(0, Ok(&left)).0, HostState::Connected);
+    // The rig file of left on the other computer: it is refused, and left goes on.
+    let (refused, why) = state(1, Ok(&left));
+    assert!(refused == HostState::Refused && why.contains("its name is \"left\""), "{why}");
+    assert_eq!(state(0, Ok(&left)).0, HostState::Connected);
+    let top = said_by("top", "wrist");
+    let (refused, why) = state(1, Ok(&top));
+    assert!(refused == HostState::Refused && why.contains("on host left"), "{why}");
+    assert_eq!(state(0, Ok(&left)).0, HostState::Connected, "it was there first");
+    // Its camera moved while it is away.
+    let away = Error::new(ErrorKind::Unreachable, "switched off");
+    assert_eq!(state(0, Err(&away)).0, HostState::Absent);
+    assert_eq!(state(1, Ok(&top)).0, HostState::Connected);
+    assert!(state(0, Ok(&left)).1.contains("on host top"));
+}
+
+#[test]
+fn a_part_that_never_began_does_not_hold_up_the_others() {
+    let tmp = tempfile::Builder::new().prefix("dh").rand_bytes(4).tempdir_in("/tmp").unwrap();
+    let hosts = three(tmp.path());
+    let left = &hosts.others[0];
+    let name = &left.config.name;
+    lock(&hosts.sessions).begin(&recording(tmp.path(), "one"), &RecordRequest::default());
+    let is_there = |name: &str| {
+        let error = Error::new(ErrorKind::NotFound, "no such recording");
+        let session = lock(&hosts.sessions).newest().unwrap().clone();
+        hosts.pulled(left, &session, name, Err(error));
+        lock(&hosts.sessions).newest().unwrap().parts.iter().any(|part| part.name == name)
+    };
+    let long_ago = || HostTime::now().plus_ns(-40_000_000_000);
+    lock(&hosts.sessions).add("one", name, "one_left");
+    assert!(is_there("one_left"), "it may be about to begin");
+    lock(&hosts.sessions).change("one", "one_left", |part| part.since = long_ago());
+    lock(&left.seen).recording = Some("one_left".to_owned());
+    assert!(is_there("one_left"), "it is recorded");
+    lock(&left.seen).recording = Some("one_left_2".to_owned());
+    let growing = tmp.path().join(".pulling/one_left");
+    fs::create_dir_all(&growing).unwrap();
+    assert!(is_there("one_left"), "some of it came");
+    fs::remove_dir(&growing).unwrap();
+    assert!(!is_there("one_left"));
+    assert!(lock(&hosts.sessions).excuse(name).unwrap().contains("one_left never began"));
 }
 
 #[test]

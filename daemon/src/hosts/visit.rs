@@ -1,10 +1,10 @@
 //! Actions that follow from one look at a host, and pulling what it records, which no action waits for.
 
-use super::pull::{Pull, Pulled};
-use super::session::Session;
+use super::pull::{self, Pull, Pulled};
+use super::session::{Part, Session};
 use super::{Host, Hosts};
 use crate::client::Client;
-use crate::{Error, Result};
+use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::HostTime;
 use depthrig_bus::sync::lock;
@@ -12,28 +12,33 @@ use std::sync::atomic::AtomicBool;
 
 /// A part is pulled for so long before its files are listed again.
 const PULL_FOR: Duration = Duration::from_millis(500);
+/// A part that is not there so long after it was asked for never began: a request has an answer, or is given up, sooner.
+const NEVER_BEGAN: Duration = Duration::from_secs(30);
 
 impl Hosts {
     /// Begins (if it `may_begin`) and ends parts on a host, by what was seen of it last.
     pub(super) fn visit(&self, host: &Host, client: &Client, may_begin: bool) {
-        let name = &host.config.name;
-        let recorded = || lock(&host.seen).recording.clone();
-        if let Some(part) = recorded()
-            && lock(&self.sessions).is_over(&part)
-        {
-            match client.record_stop() {
-                Ok(_) => self.recorded(host, None),
-                Err(e) => tracing::warn!("host {name} does not end its part {part} yet: {e}"),
-            }
-            self.changed.notify_all();
-        }
-        let sessions = lock(&self.sessions).of(name);
-        let recorded = recorded();
+        self.end_part(host, client);
+        let sessions = lock(&self.sessions).of(&host.config.name);
+        let recorded = lock(&host.seen).recording.clone();
         for session in sessions.iter().filter(|session| may_begin && session.goes_on) {
             if !session.parts.iter().any(|p| recorded.as_ref() == Some(&p.name)) {
                 self.begin_part(host, client, session, recorded.as_deref());
             }
         }
+    }
+
+    /// Ends what a host was seen to record, if it is a part of a recording that has ended.
+    pub(super) fn end_part(&self, host: &Host, client: &Client) {
+        let Some(part) = lock(&host.seen).recording.clone() else { return };
+        if !lock(&self.sessions).is_over(&part) {
+            return;
+        }
+        match client.record_stop() {
+            Ok(_) => self.recorded(host, None),
+            Err(e) => tracing::warn!("host {} does not end its part {part} yet: {e}", host.config.name),
+        }
+        self.changed.notify_all();
     }
 
     /// Pulls some of each part that the host has. Returns whether there is more.
@@ -88,7 +93,7 @@ impl Hosts {
                 self.recorded(host, Some(status.name));
             }
             // It may have begun all the same: the next look says so.
-            Err(e) if e.kind() == crate::ErrorKind::Unreachable => {
+            Err(e) if e.kind() == ErrorKind::Unreachable => {
                 tracing::warn!("host {name} did not say whether it records {part}: {e}");
             }
             Err(e) => {
@@ -114,9 +119,15 @@ impl Hosts {
     }
 
     /// Writes down how far a part has come; whether there is more of it.
-    fn pulled(&self, host: &Host, session: &Session, part: &str, pulled: Result<Pulled>) -> bool {
+    pub(super) fn pulled(&self, host: &Host, session: &Session, part: &str, pulled: Result<Pulled>) -> bool {
         let Pulled { bytes, copied, is_complete, is_busy } = match pulled {
             Ok(pulled) => pulled,
+            Err(e) if e.kind() == ErrorKind::NotFound && self.never_began(host, session, part) => {
+                let what = format!("host {}: its part {part} never began", host.config.name);
+                lock(&self.sessions).take_back(&session.name, &host.config.name, part, what);
+                self.changed.notify_all();
+                return false;
+            }
             Err(e) => {
                 lock(&self.sessions).change(&session.name, part, |part| part.why = Some(said(host, &e)));
                 return false;
@@ -135,6 +146,18 @@ impl Hosts {
             self.changed.notify_all();
         }
         is_busy
+    }
+}
+
+impl Hosts {
+    /// Whether a part that its host does not know was asked for in vain: so long ago that no request can be under way any more, and nothing of it
+    /// ever came here.
+    fn never_began(&self, host: &Host, session: &Session, part: &str) -> bool {
+        let recorded = lock(&host.seen).recording.clone();
+        let is_old = |p: &Part| p.name == part && p.since.elapsed() > NEVER_BEGAN;
+        recorded.as_deref() != Some(part)
+            && session.parts.iter().any(is_old)
+            && !pull::growing(&session.part_folder(part)).exists()
     }
 }
 

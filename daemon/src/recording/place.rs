@@ -1,33 +1,68 @@
 //! Where a new recording goes: its folder and its name.
 
-use crate::config::RecordingConfig;
+use crate::config::{HostConfig, RecordingConfig};
 use crate::control::RecordRequest;
 use crate::{Error, ErrorKind, Result};
 use depthrig_recorder::check_name;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use time::OffsetDateTime;
 
 /// Bytes of a scene's label that go into a folder's name. With date and suffix a name stays far below the 255
 /// that file systems allow.
 const SCENE_MAX_BYTES: usize = 80;
 
-/// Name and folder of a new dataset.
-pub fn place(config: &RecordingConfig, request: &RecordRequest, utc_ns: i64) -> Result<(String, PathBuf)> {
+/// Name and folder of a new dataset, of which `hosts` will have parts: what is left of an earlier one of that name must not be taken for its.
+///
+/// # Errors
+/// `BadInput` for a name that cannot be used, `InUse` for one that parts of an earlier recording have.
+pub fn place(
+    config: &RecordingConfig,
+    hosts: &[HostConfig],
+    request: &RecordRequest,
+    utc_ns: i64,
+) -> Result<(String, PathBuf)> {
     let directory = request.directory.as_ref().unwrap_or(&config.directory);
     if let Some(name) = &request.name {
         check_name(name).map_err(|e| Error::new(ErrorKind::BadInput, e.to_string()).with_source(e))?;
+        if let Some(left) = left_of(name, hosts, directory) {
+            let text = format!(
+                "{} belongs to an earlier recording {name}; choose another --name, or move it away",
+                directory.join(left).display()
+            );
+            return Err(Error::new(ErrorKind::InUse, text));
+        }
         return Ok((name.clone(), directory.join(name)));
     }
     let plain = default_name(&request.scene, utc_ns);
     // Two recordings of a scene in one minute are no mistake.
     let mut name = plain.clone();
     let mut n = 2;
-    while directory.join(&name).symlink_metadata().is_ok() {
+    while directory.join(&name).symlink_metadata().is_ok() || left_of(&name, hosts, directory).is_some() {
         name = format!("{plain}_{n}");
         n += 1;
     }
     let path = directory.join(&name);
     Ok((name, path))
+}
+
+/// What lies in `directory` of an earlier recording `name`: the part of a host, or what the parts were joined into.
+fn left_of(name: &str, hosts: &[HostConfig], directory: &Path) -> Option<String> {
+    let of_host = |rest: &str, host: &str| {
+        let number = rest.strip_prefix(host)?;
+        let digits = number.strip_prefix('_').filter(|digits| !digits.is_empty()).unwrap_or("x");
+        (number.is_empty() || digits.bytes().all(|b| b.is_ascii_digit())).then_some(())
+    };
+    let is_left = |entry: &str| {
+        let rest = entry.strip_prefix(name).and_then(|rest| rest.strip_prefix('_'));
+        rest.is_some_and(|rest| {
+            rest == "joined" || hosts.iter().any(|host| of_host(rest, host.name.as_str()).is_some())
+        })
+    };
+    if hosts.is_empty() {
+        return None;
+    }
+    let entries = std::fs::read_dir(directory).into_iter().flatten().filter_map(core::result::Result::ok);
+    entries.filter_map(|entry| entry.file_name().into_string().ok()).find(|entry| is_left(entry))
 }
 
 /// `YYYYMMDD_HHMM_<scene>` in UTC. Letters and digits of every script stay, as do `-`, `_` and `.`; each run of
@@ -58,6 +93,8 @@ fn default_name(scene: &str, utc_ns: i64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::Reach;
+    use depthrig_bus::Name;
     use proptest::prelude::*;
 
     const UTC_NS: i64 = 1_795_000_000_000_000_000;
@@ -90,7 +127,7 @@ mod tests {
             let request = RecordRequest { scene, ..RecordRequest::default() };
             let plain = default_name(&request.scene, UTC_NS);
             for n in 1..4 {
-                let (name, path) = place(&config, &request, UTC_NS).unwrap();
+                let (name, path) = place(&config, &[], &request, UTC_NS).unwrap();
                 let expected = if n == 1 { plain.clone() } else { format!("{plain}_{n}") };
                 prop_assert_eq!(&name, &expected);
                 prop_assert_eq!(path.parent().unwrap(), home.path());
@@ -106,7 +143,7 @@ mod tests {
         let config = RecordingConfig { directory: home.path().to_owned(), ..RecordingConfig::default() };
         let asked = |name: &str| {
             let request = RecordRequest { name: Some(name.into()), ..RecordRequest::default() };
-            place(&config, &request, UTC_NS)
+            place(&config, &[], &request, UTC_NS)
         };
         std::fs::create_dir(home.path().join("mine")).unwrap();
         // The recorder refuses a folder that holds anything; another name would not be the requested one.
@@ -117,11 +154,54 @@ mod tests {
     }
 
     #[test]
+    fn what_an_earlier_session_left_is_not_the_new_ones() {
+        let home = tempfile::tempdir().unwrap();
+        let config = RecordingConfig { directory: home.path().to_owned(), ..RecordingConfig::default() };
+        let hosts = [HostConfig {
+            name: Name::new("left").unwrap(),
+            reach: Reach::Socket("/nowhere".into()),
+            mirror: Vec::new(),
+            refine: None,
+        }];
+        let asked = |hosts: &[HostConfig]| {
+            let request = RecordRequest { name: Some("test".into()), ..RecordRequest::default() };
+            place(&config, hosts, &request, UTC_NS)
+        };
+        let free = || asked(&hosts).unwrap();
+        for (folder, is_of_it) in [
+            ("test_joined", true),
+            ("test_left", true),
+            ("test_left_2", true),
+            ("test_left_side", false),
+            ("test_leftover", false),
+            ("test_left_", false),
+            ("test2_left", false),
+            ("test_right", false),
+        ] {
+            free();
+            std::fs::create_dir(home.path().join(folder)).unwrap();
+            if is_of_it {
+                let error = asked(&hosts).unwrap_err();
+                assert_eq!(error.kind(), ErrorKind::InUse, "{folder}");
+                assert!(error.to_string().contains(&format!("/{folder} belongs to")), "{error}");
+            } else {
+                free();
+            }
+            asked(&[]).unwrap();
+            std::fs::remove_dir(home.path().join(folder)).unwrap();
+        }
+        std::fs::create_dir(home.path().join("20261118_1106_joined")).unwrap();
+        let default = || RecordRequest::default();
+        assert_eq!(place(&config, &hosts, &default(), UTC_NS).unwrap().0, "20261118_1106_2");
+        assert_eq!(place(&config, &[], &default(), UTC_NS).unwrap().0, "20261118_1106");
+    }
+
+    #[test]
     fn a_dangling_link_is_somebodys() {
         let home = tempfile::tempdir().unwrap();
         let config = RecordingConfig { directory: home.path().to_owned(), ..RecordingConfig::default() };
         std::os::unix::fs::symlink("/nowhere/at/all", home.path().join("20261118_1106")).unwrap();
-        let (name, _) = place(&config, &RecordRequest::default(), UTC_NS).unwrap();
+        let (name, _) = place(&config, &[], &RecordRequest::default(), UTC_NS).unwrap();
         assert_eq!(name, "20261118_1106_2");
     }
 }

@@ -17,7 +17,7 @@ pub struct Shift {
     pub epoch_ns: i64,
     /// The shift may be wrong by this much, nanoseconds.
     pub uncertainty_ns: u64,
-    /// A clock stepped beside the set, so that it may be wrong by more.
+    /// A clock stepped beside the set, or was not known for a while, so that it may be wrong by more.
     pub is_doubtful: bool,
 }
 
@@ -102,18 +102,23 @@ impl SessionClock {
     }
 }
 
+/// Farther from its nearest sample the place of a set is doubtful: the clock was not known yet, or not for a while.
+const NEAR_NS: u64 = 1_000_000_000;
+
 /// The place of a set by the sample nearest in time, which is at most 0.1 s away while the recording has all of them;
 /// with its epoch.
 fn place(tick: HostTime, samples: &[ClockSample]) -> Option<(u32, Place)> {
     let after = samples.partition_point(|s| s.time <= tick);
     let around = [after.checked_sub(1).and_then(|i| samples.get(i)), samples.get(after)];
     let nearest = around.iter().flatten().min_by_key(|s| tick.since_ns(s.time).saturating_abs())?;
-    let r = nearest.reading.moved(tick.since_ns(nearest.time));
+    let off_ns = tick.since_ns(nearest.time);
+    let r = nearest.reading.moved(off_ns);
+    let is_between_epochs = matches!(around, [Some(a), Some(b)] if a.reading.epoch != b.reading.epoch);
     let shift = Shift {
         ns: r.offset_ns,
         epoch_ns: r.offset_ns,
         uncertainty_ns: r.uncertainty_ns,
-        is_doubtful: matches!(around, [Some(a), Some(b)] if a.reading.epoch != b.reading.epoch),
+        is_doubtful: is_between_epochs || off_ns.unsigned_abs() > NEAR_NS,
     };
     let place = Place { session_ns: tick.plus_ns(shift.ns).ns(), shift };
     Some((r.epoch, place))
@@ -141,6 +146,7 @@ mod tests {
         // Before the first and after the last.
         assert_eq!((at(0).shift.ns, at(0).shift.is_doubtful), (5_000 - 10_000, false));
         assert_eq!((at(400).shift.ns, at(400).shift.is_doubtful), (-7_000 + 10_000, false));
+        assert!(!at(1300).shift.is_doubtful && at(1301).shift.is_doubtful && at(-901).shift.is_doubtful);
         assert_eq!(place(HostTime::from_ns(0), &[]), None);
     }
 }

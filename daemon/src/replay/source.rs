@@ -69,12 +69,13 @@ pub struct Moment {
 }
 
 impl Sources {
-    /// Opens `paths` as the rig `rig`, or as the one that they were recorded from.
+    /// Opens `paths` as the rig `rig`, or as the one that they were recorded from. Several that have no clock of one session go by UTC if that
+    /// is permitted.
     ///
     /// # Errors
-    /// [`ErrorKind::NotFound`], [`ErrorKind::PermissionDenied`], [`ErrorKind::BadInput`] when they are not of one rig,
+    /// [`ErrorKind::NotFound`], [`ErrorKind::PermissionDenied`], [`ErrorKind::BadInput`] when they are not of one rig or must not go by UTC,
     /// [`ErrorKind::Other`] when one of them is not a dataset or has no set, or the disk fails.
-    pub fn open(paths: &[PathBuf], rig: Option<RigName>) -> Result<Self> {
+    pub fn open(paths: &[PathBuf], rig: Option<RigName>, by_utc: bool) -> Result<Self> {
         let mut sources = Vec::new();
         let mut streams: Vec<StreamRecord> = Vec::new();
         let mut units: Vec<MotionRecord> = Vec::new();
@@ -141,6 +142,14 @@ impl Sources {
         }
         // Beside a dataset without the session's clock all go by UTC.
         if let Some(without) = sources.iter().position(|s| s.clock.is_none()) {
+            if !by_utc && sources.len() > 1 {
+                return Err(bad(format!(
+                    "{} has no clock of the session, or several: its computer had no answer from the recorder's (UDP, which a firewall may hold \
+                     back), or one of both was started meanwhile. Its sets can be matched by UTC alone, as exactly as the clocks of both \
+                     computers were set: depthrig replay PART... --record DIR",
+                    sources[without].dataset.path().display()
+                )));
+            }
             if sources.iter().any(|s| s.clock.is_some()) {
                 let path = sources[without].dataset.path().display();
                 tracing::warn!(

@@ -2,6 +2,7 @@
 
 use super::{Inner, controls, lock, report};
 use crate::attached::System;
+use crate::config::RigConfig;
 use crate::control::{
     CalibratedImage, CameraControls, Control, ControlChanges, ControlList, ControlRequest, EpisodeRequest,
     FollowRequest, GridStreams, LiveRig, RecordRequest, RecordingEpisodes, Shows,
@@ -49,7 +50,9 @@ impl Control for Inner {
         // Doctor would find that a rig of this name runs: it is the one that answers.
         let around = Surroundings { root: SysRoot::new("/"), runtime: None, measure_disk: false };
         let system = System::of_rig(&self.config, Some(self.runtime.clone()));
-        doctor::examine_all(&self.config, &around, &system)
+        // Its own socket has the address of the clock, and its threads the way to the other computers: `status` says how they do.
+        let config = RigConfig { link: None, ..self.config.clone() };
+        doctor::examine_all(&config, &around, &system)
     }
 
     fn calibration(&self) -> Vec<CalibratedImage> {

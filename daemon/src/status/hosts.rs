@@ -13,11 +13,13 @@ pub struct HostsStatus {
 }
 
 impl HostsStatus {
-    /// Whether a computer is away or refused, has no part of a recording that goes on, or sends no frames of a stream.
+    /// Whether a computer is away or refused, has no part of a recording that goes on, records without the session's clock, or sends no frames of a
+    /// stream.
     pub fn is_ill(&self) -> bool {
         self.hosts.iter().any(|host| {
             let is_ill = host.state != HostState::Connected || host.why.is_some();
-            is_ill || host.mirrors.iter().any(|mirror| mirror.why.is_some())
+            let is_timeless = host.recording.is_some() && !host.has_clock;
+            is_ill || is_timeless || host.mirrors.iter().any(|mirror| mirror.why.is_some())
         }) || self.session.as_ref().is_some_and(|s| s.joined == JoinState::Failed)
     }
 }

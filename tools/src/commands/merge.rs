@@ -69,7 +69,7 @@ fn join_hosts(args: &MergeArgs, context: &Context) -> Result<Exit> {
         [only] => core::iter::once(only.clone()).chain(parts_of(only)?).collect(),
         several => several.to_vec(),
     };
-    let sets = join(&inputs, &args.out, &context.runtime()?, stop.flag())?;
+    let sets = join(&inputs, &args.out, &context.runtime()?, 0, stop.flag())?;
     if args.json {
         out::json(&serde_json::json!({ "path": args.out, "sets": sets, "inputs": inputs }))?;
     } else {

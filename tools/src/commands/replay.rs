@@ -208,6 +208,7 @@ const LINGER: Duration = Duration::from_millis(300);
 fn replay(args: &StartArgs, context: &Context) -> Result<Exit> {
     let stop = Stop::on_signals()?;
     let options = ReplayOptions {
+        by_utc: true,
         in_background: false,
         rate: args.rate,
         looped: args.looped,

@@ -4,8 +4,8 @@
 //! being written has the ending `.part`; what a killed run left in it is kept but for a last, incomplete line. Sums are text
 //! with all their digits: what is read is what was written.
 
-use super::{Place, Source};
 use super::refine::RowInfo;
+use super::{Place, Source};
 use anyhow::{Context, Result, bail};
 use depthrig_bus::files::sync_folder_of;
 use depthrig_cdm::metrics::{DepthRange, Measured, Rules};
