@@ -169,6 +169,8 @@ def test_one_start_records_both_and_their_parts_become_one_dataset(rig: Rig) -> 
     rig.start("here")
     rig.start("there")
     wait_for("the clock", lambda: rig.host()["has_clock"])
+    # The first ticks of both lie where the cameras of each have them.
+    time.sleep(3)
     said = rig.ask("record", "start", "--name", "kitchen", "--scene", "kitchen", "--operator", "ada")
     assert "host left: recording kitchen_left" in said
     assert rig.status("there")["recording"]["name"] == "kitchen_left"
@@ -208,6 +210,34 @@ def test_one_start_records_both_and_their_parts_become_one_dataset(rig: Rig) -> 
         "here", "sh", "-c", f"{rig.binary} merge --hosts {again} {own} 2>&1", codes=(1,), DEPTHRIG_RUNTIME_DIR=str(rig.runtime["here"])
     )
     assert "[link]" not in rig.log("here")
+    # A recording of the same name would have parts of the same names, and the old result.
+    for path in (own, part):
+        shutil.rmtree(path)
+    said = rig.hosts.run(
+        "here", "sh", "-c", f"{rig.binary} record start --name kitchen 2>&1", codes=(1,), DEPTHRIG_RUNTIME_DIR=str(rig.runtime["here"])
+    )
+    assert "kitchen_joined belongs to an earlier recording kitchen; choose another --name" in said
+    assert joined.is_dir() and not own.exists()
+
+
+def test_a_part_without_the_clock_is_not_joined_by_utc(rig: Rig) -> None:
+    # As behind a firewall that lets OpenSSH pass and no UDP.
+    text = rig.rig_file("there").read_text()
+    rig.rig_file("there").write_text(text.replace(":7447", ":7448"))
+    rig.start("here")
+    rig.start("there")
+    said = rig.ask("record", "start", "--name", "blind", codes=(3,))
+    assert "host left: recording blind_left, its clock is not known yet" in said
+    time.sleep(2)
+    rig.ask("status", codes=(3,))
+    rig.ask("record", "stop")
+    wait_for("word of it", lambda: rig.session()["joined"] == "failed")
+    assert "blind_left has no clock of the session" in rig.session()["why"]
+    assert not (rig.data("here") / "blind_joined").exists()
+    # Who knows how exactly both clocks were set may say so.
+    own, part = (rig.data("here") / name for name in ("blind", "blind_left"))
+    rig.ask("replay", str(own), str(part), "--as-fast-as-possible", "--rig", "again", "--record", str(rig.folder / "by_utc"), codes=(0, 3))
+    assert list((rig.folder / "by_utc").rglob("session.toml"))
 
 
 def test_doctor_measures_the_way_before_a_session(rig: Rig) -> None:

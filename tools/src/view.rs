@@ -1,6 +1,6 @@
 //! The status of a rig as text: what `status` prints and `top` refreshes.
 
-mod hosts;
+pub mod hosts;
 
 use crate::printable::{BOLD, GREEN, RED, RESET, YELLOW};
 use crate::{out, printable};

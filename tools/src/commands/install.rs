@@ -122,6 +122,8 @@ For the service:
   install -d -o {user} {data}
   systemctl daemon-reload && systemctl enable --now depthrig
   DEPTHRIG_RUNTIME_DIR=/run/depthrig depthrig status      (as {user}; its subscribers need the variable too)
+For a rig of several computers (`[link]`), which the service may not reach by itself:
+  systemctl edit depthrig                                 ([Service] and IPAddressAllow= with their addresses, such as 10.0.0.0/24)
 
 Then look: depthrig cameras, and depthrig doctor {rig_file}"
     )

@@ -4,6 +4,7 @@ use crate::context::Context;
 use crate::exit::Exit;
 use crate::out;
 use crate::printable;
+use crate::view;
 use anyhow::{Context as _, Result};
 use depthrig_daemon::client::Client;
 use depthrig_daemon::control::RecordRequest;
@@ -97,7 +98,10 @@ pub fn run(command: &RecordCommand, context: &Context) -> Result<Exit> {
             }
             for host in &hosts.hosts {
                 match (&host.recording, &host.why) {
-                    (Some(part), None) => out::line(format_args!("host {}: recording {part}", host.host))?,
+                    (Some(part), None) => {
+                        let clock = view::hosts::clock(host);
+                        out::line(format_args!("host {}: recording {part}{clock}", host.host))?;
+                    }
                     (_, why) => {
                         let why = why.as_deref().unwrap_or("records nothing yet");
                         out::line(format_args!("host {}: {}", host.host, printable::line(why)))?;

@@ -19,6 +19,11 @@ pub(super) fn lines(status: &HostsStatus, style: Style) -> Vec<String> {
     hosts.chain(status.session.iter().flat_map(|s| session(s, style))).collect()
 }
 
+/// What is wrong with the clock of a host that answers; empty if nothing is.
+pub fn clock(host: &HostStatus) -> &'static str {
+    if host.has_clock { "" } else { ", its clock is not known yet (UDP must pass to the address in listen)" }
+}
+
 fn host(host: &HostStatus, style: Style) -> String {
     let name = &host.host;
     let why = host.why.as_deref().map(printable::line).unwrap_or_default();
@@ -28,7 +33,7 @@ fn host(host: &HostStatus, style: Style) -> String {
         HostState::Connected => {
             let cameras =
                 format!("{} of {} stream", host.streaming, out::count(host.cameras as u64, "camera"));
-            let clock = if host.has_clock { "" } else { ", its clock is not known yet" };
+            let clock = clock(host);
             let recording = host.recording.as_deref().map(|r| format!(", recording {}", printable::line(r)));
             let recording = recording.unwrap_or_default();
             let trouble =
