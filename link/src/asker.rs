@@ -292,13 +292,12 @@ mod tests {
     fn silence_is_asked_from_another_socket() {
         let host = UdpSocket::bind("127.0.0.1:0").unwrap();
         host.set_read_timeout(Some(Duration::from_secs(30))).unwrap();
-        let asker = Asker::start(host.local_addr().unwrap(), Trust::Anyone).unwrap();
         let began = HostTime::now();
-        let mut from =
-            |n: usize| (0..n).map(|_| host.recv_from(&mut [0; 100]).unwrap().1).collect::<Vec<_>>();
-        let first = from(1)[0];
-        while from(1)[0] == first {
-            assert!(began.elapsed() < Duration::from_secs(60), "the same socket for ever");
+        let asker = Asker::start(host.local_addr().unwrap(), Trust::Anyone).unwrap();
+        let from = || host.recv_from(&mut [0; 100]).unwrap().1;
+        let first = from();
+        while from() == first {
+            assert!(began.elapsed() < Duration::from_mins(1), "the same socket for ever");
         }
         assert!(began.elapsed() >= SILENT && asker.state().answered == 0);
     }

@@ -31,6 +31,7 @@ const SILENCE: Duration = Duration::from_millis(150);
 /// For what would otherwise hang.
 const TIMEOUT: Duration = Duration::from_secs(20);
 const FAST: ReplayOptions = ReplayOptions {
+    by_utc: true,
     in_background: false,
     rate: 1.0,
     looped: false,

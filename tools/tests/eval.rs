@@ -328,6 +328,36 @@ fn a_recording_with_truth_is_compared_in_one_view() {
 }
 
 #[test]
+fn each_camera_of_a_relabelled_dataset_counts_once() {
+    let home = Home::new();
+    let cache = home.path().join("cache").display().to_string();
+    let stream = |name: &str| format!("[[camera.stream]]\nname = \"{name}\"\nwidth = 160\nheight = 120\n");
+    let streams = ["color", "depth", "depth_true_color"].map(stream).concat();
+    let camera = |name: &str| {
+        format!(
+            "[[camera]]\nname = \"{name}\"\nbackend = \"synthetic\"\nmodel = \"generic\"\ntruth = true\nposes = 2\n\
+             cache_dir = \"{cache}\"\n{streams}"
+        )
+    };
+    let rig = format!("rig = \"sim\"\n[recording]\nreserve_mb = 16\n{}{}", camera("left"), camera("right"));
+    let rig = home.write("rig.toml", &rig);
+    let at = |name: &str| home.path().join(name).to_str().unwrap().to_owned();
+    let said = home.run(&["run", &rig, "--record", &at("data"), "--seconds", "2", "--json", "-q"]);
+    let summary: Value = serde_json::from_str(&said.done()).unwrap();
+    let path = summary["recording"]["path"].as_str().unwrap();
+    home.run(&["cdm", "relabel", path, &at("again"), "--engine", "fill", "-q"]).done();
+    let images = |path: &str| -> Vec<(String, u64)> {
+        let got = evaluate_recorded(&home, &[path, "--pred", "depth"]);
+        let rows = got["rows"].as_array().unwrap();
+        let of = |r: &Value| (r["group"].as_str().unwrap().to_owned(), r["images"].as_u64().unwrap());
+        rows.iter().map(of).collect()
+    };
+    let recorded = images(path);
+    assert!(recorded.len() == 2 && recorded[0].1 >= 3, "{recorded:?}");
+    assert_eq!(images(&at("again")), recorded);
+}
+
+#[test]
 fn a_model_gives_the_depth_of_cdm_run() {
     let home = Home::new();
     let at = |name: &str| home.path().join(name).to_str().unwrap().to_owned();

@@ -374,7 +374,7 @@ fn three(tmp: &Path) -> Hosts {
     Hosts::new(&config, &runtime, None, Arc::default(), None).unwrap().unwrap()
 }
 
-/// What a daemon says that calls itself `host` and has `camera`.
+/// Status of a daemon that calls itself `host` and has `camera`.
 fn said_by(host: &str, camera: &str) -> RigStatus {
     let link = LinkStatus {
         host: host.to_owned(),

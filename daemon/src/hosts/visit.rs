@@ -122,7 +122,7 @@ impl Hosts {
     pub(super) fn pulled(&self, host: &Host, session: &Session, part: &str, pulled: Result<Pulled>) -> bool {
         let Pulled { bytes, copied, is_complete, is_busy } = match pulled {
             Ok(pulled) => pulled,
-            Err(e) if e.kind() == ErrorKind::NotFound && self.never_began(host, session, part) => {
+            Err(e) if e.kind() == ErrorKind::NotFound && never_began(host, session, part) => {
                 let what = format!("host {}: its part {part} never began", host.config.name);
                 lock(&self.sessions).take_back(&session.name, &host.config.name, part, what);
                 self.changed.notify_all();
@@ -149,16 +149,14 @@ impl Hosts {
     }
 }
 
-impl Hosts {
-    /// Whether a part that its host does not know was asked for in vain: so long ago that no request can be under way any more, and nothing of it
-    /// ever came here.
-    fn never_began(&self, host: &Host, session: &Session, part: &str) -> bool {
-        let recorded = lock(&host.seen).recording.clone();
-        let is_old = |p: &Part| p.name == part && p.since.elapsed() > NEVER_BEGAN;
-        recorded.as_deref() != Some(part)
-            && session.parts.iter().any(is_old)
-            && !pull::growing(&session.part_folder(part)).exists()
-    }
+/// Whether a part that its host does not know was asked for in vain: so long ago that no request can be under way any more, and nothing of it
+/// ever came here.
+fn never_began(host: &Host, session: &Session, part: &str) -> bool {
+    let recorded = lock(&host.seen).recording.clone();
+    let is_old = |p: &Part| p.name == part && p.since.elapsed() > NEVER_BEGAN;
+    recorded.as_deref() != Some(part)
+        && session.parts.iter().any(is_old)
+        && !pull::growing(&session.part_folder(part)).exists()
 }
 
 fn said(host: &Host, e: &Error) -> String {

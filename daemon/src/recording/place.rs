@@ -45,7 +45,7 @@ pub fn place(
     Ok((name, path))
 }
 
-/// What lies in `directory` of an earlier recording `name`: the part of a host, or what the parts were joined into.
+/// A leftover in `directory` of an earlier recording `name`: the part of a host, or what the parts were joined into.
 fn left_of(name: &str, hosts: &[HostConfig], directory: &Path) -> Option<String> {
     let of_host = |rest: &str, host: &str| {
         let number = rest.strip_prefix(host)?;

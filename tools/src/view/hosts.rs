@@ -19,7 +19,7 @@ pub(super) fn lines(status: &HostsStatus, style: Style) -> Vec<String> {
     hosts.chain(status.session.iter().flat_map(|s| session(s, style))).collect()
 }
 
-/// What is wrong with the clock of a host that answers; empty if nothing is.
+/// The fault of the clock of a host that answers; empty without one.
 pub fn clock(host: &HostStatus) -> &'static str {
     if host.has_clock { "" } else { ", its clock is not known yet (UDP must pass to the address in listen)" }
 }
