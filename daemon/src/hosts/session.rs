@@ -44,6 +44,8 @@ pub(super) struct Session {
 pub(super) struct Part {
     pub(super) host: Name,
     pub(super) name: String,
+    /// It was asked for, and nothing said yet that it began.
+    pub(super) is_asked: bool,
     pub(super) is_complete: bool,
     pub(super) bytes: u64,
     pub(super) pulled_bytes: u64,
@@ -66,6 +68,8 @@ struct Written {
 struct WrittenPart {
     host: Name,
     name: String,
+    #[serde(default, skip_serializing_if = "core::ops::Not::not")]
+    asked: bool,
     #[serde(default)]
     complete: bool,
 }
@@ -146,6 +150,7 @@ impl Session {
         let part = |part: WrittenPart| Part {
             host: part.host,
             name: part.name,
+            is_asked: part.asked,
             is_complete: part.complete,
             bytes: 0,
             pulled_bytes: 0,
@@ -170,6 +175,7 @@ impl Session {
         let part = |part: &Part| WrittenPart {
             host: part.host.clone(),
             name: part.name.clone(),
+            asked: part.is_asked,
             complete: part.is_complete,
         };
         let written = Written {
@@ -271,6 +277,7 @@ impl Sessions {
         session.parts.push(Part {
             host: host.clone(),
             name: part.to_owned(),
+            is_asked: true,
             is_complete: false,
             bytes: 0,
             pulled_bytes: 0,
@@ -300,9 +307,10 @@ impl Sessions {
     pub(super) fn change(&mut self, session: &str, part: &str, change: impl FnOnce(&mut Part)) {
         let Some(session) = self.0.iter_mut().rfind(|s| s.name == session) else { return };
         let Some(part) = session.parts.iter_mut().find(|p| p.name == part) else { return };
-        let before = part.is_complete;
+        let written = |part: &Part| (part.is_asked, part.is_complete);
+        let before = written(part);
         change(part);
-        if part.is_complete != before {
+        if written(part) != before {
             session.keep();
         }
     }

@@ -445,6 +445,13 @@ fn a_part_that_never_began_does_not_hold_up_the_others() {
     fs::create_dir_all(&growing).unwrap();
     assert!(is_there("one_left"), "some of it came");
     fs::remove_dir(&growing).unwrap();
+    // What is known to have begun has its images somewhere, also after a restart.
+    lock(&hosts.sessions).change("one", "one_left", |part| part.is_asked = false);
+    assert!(is_there("one_left"));
+    let read = || Sessions::left_in(tmp.path()).newest().unwrap().parts[0].is_asked;
+    assert!(!read());
+    lock(&hosts.sessions).change("one", "one_left", |part| part.is_asked = true);
+    assert!(read());
     assert!(!is_there("one_left"));
     assert!(lock(&hosts.sessions).excuse(name).unwrap().contains("one_left never began"));
 }

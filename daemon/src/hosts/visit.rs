@@ -21,6 +21,12 @@ impl Hosts {
         self.end_part(host, client);
         let sessions = lock(&self.sessions).of(&host.config.name);
         let recorded = lock(&host.seen).recording.clone();
+        for session in &sessions {
+            let has_begun = |p: &&Part| p.is_asked && recorded.as_ref() == Some(&p.name);
+            for part in session.parts.iter().filter(has_begun) {
+                self.began(session, &part.name);
+            }
+        }
         for session in sessions.iter().filter(|session| may_begin && session.goes_on) {
             if !session.parts.iter().any(|p| recorded.as_ref() == Some(&p.name)) {
                 self.begin_part(host, client, session, recorded.as_deref());
@@ -90,6 +96,7 @@ impl Hosts {
         match client.record_start(&request) {
             Ok(status) => {
                 tracing::info!("host {name} records {}", status.name);
+                self.began(session, &part);
                 self.recorded(host, Some(status.name));
             }
             // It may have begun all the same: the next look says so.
@@ -106,6 +113,10 @@ impl Hosts {
             }
         }
         self.changed.notify_all();
+    }
+
+    fn began(&self, session: &Session, part: &str) {
+        lock(&self.sessions).change(&session.name, part, |part| part.is_asked = false);
     }
 
     /// A part that nobody records is incomplete because nobody closed it: its daemon was killed, and recovers it after its start.
@@ -153,7 +164,7 @@ impl Hosts {
 /// ever came here.
 fn never_began(host: &Host, session: &Session, part: &str) -> bool {
     let recorded = lock(&host.seen).recording.clone();
-    let is_old = |p: &Part| p.name == part && p.since.elapsed() > NEVER_BEGAN;
+    let is_old = |p: &Part| p.name == part && p.is_asked && p.since.elapsed() > NEVER_BEGAN;
     recorded.as_deref() != Some(part)
         && session.parts.iter().any(is_old)
         && !pull::growing(&session.part_folder(part)).exists()
