@@ -87,7 +87,7 @@ impl CdmRefiner {
     ///
     /// # Errors
     /// [`crate::ErrorKind::BadInput`] for an input size that cannot be used, [`crate::ErrorKind::BadModel`] when the
-    /// model has no position embeddings, [`crate::ErrorKind::Engine`] when the threads cannot be started.
+    /// model has no position embeddings, [`crate::ErrorKind::Engine`] when the system starts no more threads.
     pub fn new(
         network: Box<dyn Network>,
         model: &Model,

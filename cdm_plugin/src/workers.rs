@@ -77,20 +77,21 @@ impl Workers {
     /// Starts `threads` threads; 0 and 1 use the caller's thread.
     ///
     /// # Errors
-    /// [`ErrorKind::Engine`] when the threads cannot be started.
+    /// [`ErrorKind::Engine`] when the system starts no more threads.
     pub(crate) fn new(threads: usize) -> Result<Self> {
         let build = || {
             let name = |i| format!("refine-{i}");
             rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(name).build()
         };
         let pool = (threads > 1).then(build).transpose().map_err(|e| {
-            let message = format!("the {threads} threads to refine depth cannot be started ({e}); use fewer");
+            let message =
+                format!("the system does not start {threads} threads to refine depth ({e}); use fewer");
             Error::new(ErrorKind::Engine, message).with_source(e)
         })?;
         Ok(Self { pool, wide: Wide::detect() })
     }
 
-    /// How many threads there are, and so how many bands of rows are worth making.
+    /// Number of threads, and so of bands of rows that are worth making.
     pub(crate) fn threads(&self) -> usize {
         self.pool.as_ref().map_or(1, rayon::ThreadPool::current_num_threads)
     }

@@ -98,7 +98,7 @@ def test_a_folder_holds_shards_of_one_making(
     assert not writer.part.exists(), "nothing was written to it"
     assert made(text, "--per-shard", "2") == (0, "")
     assert {p.name: p.read_bytes() for p in out.iterdir()} == kept
-    # A shard of which every sample is left out is no file, and the others are read.
+    # A shard of which every sample is left out makes no file, and the others are read.
     monkeypatch.setattr(make_shards, "_usable", lambda sample: "0000000004" not in sample.name)
     out = tmp_path / "few"
     assert made(text, "--per-shard", "2") == (0, "")

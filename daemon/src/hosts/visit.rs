@@ -160,7 +160,7 @@ impl Hosts {
     }
 }
 
-/// Whether a part that its host does not know was asked for in vain: so long ago that no request can be under way any more, and nothing of it
+/// True of a part that its host does not know and that was asked for in vain: so long ago that no request can be under way any more, and nothing of it
 /// ever came here.
 fn never_began(host: &Host, session: &Session, part: &str) -> bool {
     let recorded = lock(&host.seen).recording.clone();

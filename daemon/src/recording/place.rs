@@ -14,7 +14,7 @@ const SCENE_MAX_BYTES: usize = 80;
 /// Name and folder of a new dataset, of which `hosts` will have parts: what is left of an earlier one of that name must not be taken for its.
 ///
 /// # Errors
-/// `BadInput` for a name that cannot be used, `InUse` for one that parts of an earlier recording have.
+/// `BadInput` for an invalid name, `InUse` for one that parts of an earlier recording have.
 pub fn place(
     config: &RecordingConfig,
     hosts: &[HostConfig],
@@ -47,20 +47,18 @@ pub fn place(
 
 /// A leftover in `directory` of an earlier recording `name`: the part of a host, or what the parts were joined into.
 fn left_of(name: &str, hosts: &[HostConfig], directory: &Path) -> Option<String> {
-    let of_host = |rest: &str, host: &str| {
-        let number = rest.strip_prefix(host)?;
-        let digits = number.strip_prefix('_').filter(|digits| !digits.is_empty()).unwrap_or("x");
-        (number.is_empty() || digits.bytes().all(|b| b.is_ascii_digit())).then_some(())
-    };
-    let is_left = |entry: &str| {
-        let rest = entry.strip_prefix(name).and_then(|rest| rest.strip_prefix('_'));
-        rest.is_some_and(|rest| {
-            rest == "joined" || hosts.iter().any(|host| of_host(rest, host.name.as_str()).is_some())
-        })
-    };
     if hosts.is_empty() {
         return None;
     }
+    let is_number = |text: &str| !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
+    let is_part = |rest: &str, host: &HostConfig| {
+        let number = rest.strip_prefix(host.name.as_str());
+        number.is_some_and(|n| n.is_empty() || n.strip_prefix('_').is_some_and(is_number))
+    };
+    let is_left = |entry: &str| {
+        let rest = entry.strip_prefix(name).and_then(|rest| rest.strip_prefix('_'));
+        rest.is_some_and(|rest| rest == "joined" || hosts.iter().any(|host| is_part(rest, host)))
+    };
     let entries = std::fs::read_dir(directory).into_iter().flatten().filter_map(core::result::Result::ok);
     entries.filter_map(|entry| entry.file_name().into_string().ok()).find(|entry| is_left(entry))
 }

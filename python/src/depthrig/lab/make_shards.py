@@ -135,7 +135,7 @@ def make(config: Config, out: Path, part: tuple[int, int] = (0, 1), per_shard: i
 
 
 def _agree(config: Config, out: Path, sources: Sequence[Source], per_shard: int) -> None:
-    """Write into the folder what its shards are made of, or refuse one that holds others; places are no part of it."""
+    """Write into the folder what its shards are made of, or refuse one that holds others. Paths do not count."""
     synthesis = dataclasses.replace(config.synthesis, value=None, hole=None)
     model = dataclasses.replace(config.model, weights=None)
     made_by = {"synthesis": dataclasses.asdict(synthesis), "model": dataclasses.asdict(model)}
