@@ -50,8 +50,8 @@ fn wait_for(ready: &AtomicBool) {
     }
 }
 
-/// Reads every stream until `stop`; `ready` is set once it has subscribed to all.
-fn watch(home: &Home, ready: &AtomicBool, stop: &AtomicBool) -> Seen {
+/// Reads every stream until `stop`; `ready` is set once it has subscribed to all. Also returns how many frames it missed.
+fn watch(home: &Home, ready: &AtomicBool, stop: &AtomicBool) -> (Seen, u64) {
     let bus = Bus::open(&home.runtime(), &RigName::new("test").unwrap()).unwrap();
     let mut subscribers: Vec<_> =
         streams().iter().map(|id| bus.subscriber_within(id, WAIT).unwrap()).collect();
@@ -65,8 +65,7 @@ fn watch(home: &Home, ready: &AtomicBool, stop: &AtomicBool) -> Seen {
             }
         }
         if last {
-            assert!(subscribers.iter().all(|s| s.missed() == 0), "the test's own subscriber was too slow");
-            return seen;
+            return (seen, subscribers.iter().map(|s| s.missed()).sum());
         }
         std::thread::sleep(Duration::from_millis(5));
     }
@@ -80,7 +79,7 @@ fn live_recorded_and_replayed_frames_are_the_same() {
     let stop = AtomicBool::new(false);
     let ready = AtomicBool::new(false);
     let control = rig.control();
-    let (live, recorded) = std::thread::scope(|s| {
+    let ((live, missed), recorded) = std::thread::scope(|s| {
         let _stop = StopAtEnd(&stop);
         let watcher = s.spawn(|| watch(&home, &ready, &stop));
         wait_for(&ready);
@@ -114,16 +113,22 @@ fn live_recorded_and_replayed_frames_are_the_same() {
     let sets: Vec<_> = dataset.sets(SetRange::ALL).map(Result::unwrap).collect();
     assert!(sets.len() >= 10);
     let mut in_dataset = Seen::new();
+    let mut unseen = 0;
     for set in &sets {
         assert_eq!((set.frames.len(), set.missing.len()), (4, 0), "set {}", set.id);
         for frame in &set.frames {
             let key = (frame.header.stream_id().unwrap().to_string(), frame.header.device_sequence);
-            let (header, pixels) = &live[&key];
-            assert_eq!(frame.header, FrameHeader { set_id: set.id, ..*header });
-            assert!(frame.pixels == *pixels, "{key:?}");
+            if let Some((header, pixels)) = live.get(&key) {
+                assert_eq!(frame.header, FrameHeader { set_id: set.id, ..*header });
+                assert!(frame.pixels == *pixels, "{key:?}");
+            } else {
+                unseen += 1;
+            }
             in_dataset.insert(key, (frame.header, frame.pixels.clone()));
         }
     }
+    // The test's own subscriber may be late on a busy computer. What it did not see, it must have counted.
+    assert!(unseen <= missed && in_dataset.len() as u64 >= 2 * unseen, "{unseen} unseen, {missed} missed");
     replayed_is(&home, recorded.path.as_ref(), &in_dataset);
 }
 
@@ -142,7 +147,8 @@ fn replayed_is(home: &Home, path: &std::path::Path, expected: &Seen) {
             std::thread::sleep(Duration::from_millis(20));
         }
         stop.store(true, Ordering::SeqCst);
-        let seen = watcher.join().unwrap();
+        let (seen, missed) = watcher.join().unwrap();
+        assert_eq!(missed, 0, "the test's own subscriber was too slow");
         assert_eq!(replay.stop().status.lost, Vec::<String>::new());
         seen
     });
