@@ -28,7 +28,7 @@ pub use world::write_world;
 /// Version of the layout.
 pub const FORMAT: u32 = 1;
 /// Goes up when the generator makes other samples of the same arguments.
-const GENERATOR: u32 = 2;
+const GENERATOR: u32 = 3;
 /// Samples that a thread makes between two writes.
 const BATCH: usize = 8;
 

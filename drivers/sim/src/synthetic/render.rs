@@ -15,7 +15,7 @@ use std::path::PathBuf;
 use std::sync::{Arc, OnceLock};
 
 /// Goes up with every change of what is rendered, so that older caches are not used.
-const RENDER_VERSION: u32 = 2;
+const RENDER_VERSION: u32 = 3;
 
 /// Says how many of how many images are ready.
 pub type Progress<'a> = &'a (dyn Fn(usize, usize) + Sync);

@@ -1,7 +1,8 @@
 //! Depth as a time-of-flight camera reports it.
 //!
-//! Depth is missing where too little light comes back (dark, far or slanted surfaces), where a polished one
-//! sends it elsewhere, and outside the circle that the light fills. At edges a pixel mixes near and far into a
+//! Depth is missing where too little light comes back (dark, far or slanted surfaces), where too much does (near,
+//! bright or polished ones that face the camera), where a polished one sends it elsewhere, and outside the circle
+//! that the light fills. At edges a pixel mixes near and far into a
 //! depth at which nothing is ("flying pixels"). In corners, light that took a detour makes things seem farther.
 
 use super::super::models::{DepthPrinciple, Model};
@@ -13,6 +14,8 @@ use rayon::prelude::*;
 
 /// The least signal that gives a depth: albedo · cos / z² at 1 m.
 const LEAST_SIGNAL: f32 = 0.016;
+/// The signal that fills a pixel, which gives no depth then: that of a white thing at 0.35 m.
+const FULL_SIGNAL: f32 = 8.0;
 /// Neighbours this much apart, as a part of the depth, are an edge.
 const EDGE: f32 = 0.03;
 
@@ -33,9 +36,10 @@ pub(super) fn measure(view: &View<'_>, model: &Model, samples: &[Sample], seed: 
                 continue;
             }
             let rolls = Rolls::new(seed, x as u32, y as u32, 9);
-            let signal = here.albedo * (0.15 + 0.85 * here.facing) / (here.z * here.z);
+            let signal = (here.albedo * (0.15 + 0.85 * here.facing) + highlight(here)) / (here.z * here.z);
             let blotch = smooth2(x as f32 / 6.0, y as f32 / 6.0, (seed & 0xFFFF) as i32);
-            if signal < LEAST_SIGNAL * (0.7 + 0.6 * blotch) || is_lost(here, blotch) {
+            let is_enough = signal >= LEAST_SIGNAL * (0.7 + 0.6 * blotch);
+            if !is_enough || signal > FULL_SIGNAL || is_lost(here, blotch) {
                 continue;
             }
             let mixed = mix_at_edge(samples, w, h, x, y, rolls.unit(1));
@@ -46,6 +50,19 @@ pub(super) fn measure(view: &View<'_>, model: &Model, samples: &[Sample], seed: 
         }
     });
     out
+}
+
+/// The highlight of the camera's own light, in the unit of an albedo.
+///
+/// Blinn and Phong's lobe with (power + 8) / 8 as its factor, so that it is energy that is shared out (Akenine-Möller
+/// et al., Real-Time Rendering). The lamp is at the lens, so halfway between both is the ray.
+fn highlight(here: &Sample) -> f32 {
+    let (part, power) = match here.surface {
+        Surface::Glossy => (0.035, 70),
+        Surface::Shiny => (here.albedo, 180),
+        Surface::Matte | Surface::Mirror | Surface::Glass => return 0.0,
+    };
+    part * (power as f32 + 8.0) / 8.0 * here.facing.powi(power)
 }
 
 /// Whether a polished surface sent the light elsewhere.
@@ -74,4 +91,35 @@ fn mix_at_edge(samples: &[Sample], w: usize, h: usize, x: usize, y: usize, part:
         }
     }
     if (farthest - here).abs() > EDGE * here { here + (farthest - here) * part * part } else { here }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::super::models;
+    use super::super::super::motion;
+    use super::super::super::view::Rays;
+    use super::super::NO_SAMPLE;
+    use super::*;
+    use depthrig_bus::Intrinsics;
+
+    /// How many of 100 pixels of one kind have depth.
+    fn measured(surface: Surface, albedo: f32, z: f32, facing: f32) -> usize {
+        let rays = Rays::new(&Intrinsics::pinhole(100.0, 100.0, 5.0, 5.0), 10, 10);
+        let view = View::new(&rays, &motion::mount(0, 12));
+        let sample = Sample { z, albedo, facing, surface, ..NO_SAMPLE };
+        let depth = measure(&view, models::find("l515").unwrap(), &[sample; 100], 1);
+        depth.iter().filter(|z| **z > 0.0).count()
+    }
+
+    #[test]
+    fn too_much_light_is_no_depth() {
+        assert_eq!(measured(Surface::Matte, 0.9, 0.30, 1.0), 0, "white and near");
+        assert_eq!(measured(Surface::Matte, 0.9, 0.40, 1.0), 100, "white, not so near");
+        assert_eq!(measured(Surface::Matte, 0.4, 0.30, 1.0), 100, "grey and near");
+        assert_eq!(measured(Surface::Glossy, 0.9, 0.37, 1.0), 0, "a highlight on white");
+        assert_eq!(measured(Surface::Glossy, 0.9, 0.37, 0.9), 100, "beside it");
+        assert_eq!(measured(Surface::Shiny, 0.5, 1.0, 1.0), 0, "metal that faces the camera");
+        assert_eq!(measured(Surface::Shiny, 0.5, 1.0, 0.97), 100, "and a little turned");
+        assert_eq!(measured(Surface::Shiny, 0.5, 1.5, 1.0), 100, "and far");
+    }
 }
