@@ -57,12 +57,28 @@ pub fn join(
     let parts = parts.as_slice();
     let channels = RuntimeDir::at(&runtime.path().join(JOINING))?;
     let hidden = out.with_file_name(FOLDER);
-    let failed = |path: &Path, e: std::io::Error| {
-        Error::new(ErrorKind::Other, format!("{}: {e}", path.display())).with_source(e)
-    };
     umask::create_dir_all(&hidden).map_err(|e| failed(&hidden, e))?;
-    must_fit(parts, &hidden, reserve_bytes)?;
-    let growing = hidden.join(name);
+    let joined = must_fit(parts, &hidden, reserve_bytes)
+        .and_then(|()| grow(first, parts, &hidden.join(name), &channels, reserve_bytes, stop))
+        .and_then(|sets| {
+            fs::rename(hidden.join(name), out).map_err(|e| failed(out, e))?;
+            Ok(sets)
+        });
+    // Another session's result may be in it.
+    let _ = fs::remove_dir(&hidden);
+    joined
+}
+
+/// Makes and checks the dataset `growing` of `parts` with the name, scene, notes and episodes of `first`; the number of its sets. After an error nothing
+/// is left of it.
+fn grow(
+    first: &Path,
+    parts: &[PathBuf],
+    growing: &Path,
+    channels: &RuntimeDir,
+    reserve_bytes: u64,
+    stop: &AtomicBool,
+) -> Result<u64> {
     let options = ReplayOptions {
         as_fast_as_possible: true,
         in_background: true,
@@ -71,22 +87,22 @@ pub fn join(
         ..ReplayOptions::default()
     };
     // It takes the lock of the channels: what lies in the hidden folder is nobody's.
-    let replay = Replay::start(parts, &channels, None, options)?;
-    let recorded = remove(&growing)
-        .map_err(|e| failed(&growing, e))
-        .and_then(|()| record(replay, &hidden, name, reserve_bytes, stop));
-    let checked = recorded.and_then(|()| {
-        adopt(&RealFs, &growing, Dataset::open(first)?.session())?;
-        check(parts, &growing, stop)
-    });
-    if checked.is_ok() {
-        fs::rename(&growing, out).map_err(|e| failed(out, e))?;
-    } else if let Err(e) = remove(&growing) {
+    let replay = Replay::start(parts, channels, None, options)?;
+    let checked = remove(growing)
+        .map_err(|e| failed(growing, e))
+        .and_then(|()| record(replay, growing, reserve_bytes, stop))
+        .and_then(|()| {
+            adopt(&RealFs, growing, Dataset::open(first)?.session())?;
+            check(parts, growing, stop)
+        });
+    if let Some(e) = checked.is_err().then(|| remove(growing).err()).flatten() {
         tracing::warn!("{} is left: {e}", growing.display());
     }
-    // Another session's result may be in it.
-    let _ = fs::remove_dir(&hidden);
     checked
+}
+
+fn failed(path: &Path, e: std::io::Error) -> Error {
+    Error::new(ErrorKind::Other, format!("{}: {e}", path.display())).with_source(e)
 }
 
 /// Whether a part has anything to join; one that cannot be read has, and its error is that of the join.
@@ -127,12 +143,13 @@ fn remove(folder: &Path) -> std::io::Result<()> {
 }
 
 /// Records the replay to its end.
-fn record(replay: Replay, directory: &Path, name: &str, reserve_bytes: u64, stop: &AtomicBool) -> Result<()> {
+fn record(replay: Replay, growing: &Path, reserve_bytes: u64, stop: &AtomicBool) -> Result<()> {
     let control = replay.control();
+    let directory = growing.parent().unwrap_or(growing);
     // Its size was held against the disk; how fast a replay writes says nothing about how long the disk lasts.
     let request = RecordRequest {
         directory: Some(directory.to_owned()),
-        name: Some(name.to_owned()),
+        name: growing.file_name().map(|name| name.to_string_lossy().into_owned()),
         force: true,
         ..RecordRequest::default()
     };
