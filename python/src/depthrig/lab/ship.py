@@ -26,7 +26,7 @@ __all__ = ["BYTES_MAX", "main", "record", "ship"]
 BYTES_MAX = 4 << 20
 """Size of `tiny.onnx` at most: it is embedded in the program."""
 LICENCE = "MIT OR Apache-2.0"
-VERSION = 2
+VERSION = 3
 """Goes up with each network that ships."""
 
 
