@@ -95,7 +95,9 @@ fn grow(
             adopt(&RealFs, growing, Dataset::open(first)?.session())?;
             check(parts, growing, stop)
         });
-    if let Some(e) = checked.is_err().then(|| remove(growing).err()).flatten() {
+    if checked.is_err()
+        && let Err(e) = remove(growing)
+    {
         tracing::warn!("{} is left: {e}", growing.display());
     }
     checked
