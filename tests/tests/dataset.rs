@@ -1,7 +1,7 @@
 //! From camera to disk and back: the dataset and its replay equal the frames that a subscriber received live.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
-use depthrig_bus::{Bus, Frame, FrameFlags, FrameHeader, HostTime, RigName, StreamId};
+use depthrig_bus::{Bus, Frame, FrameFlags, FrameHeader, HostTime, RigName, StreamId, Subscriber};
 use depthrig_daemon::ErrorKind;
 use depthrig_daemon::control::RecordRequest;
 use depthrig_daemon::replay::{Replay, ReplayOptions};
@@ -65,7 +65,7 @@ fn watch(home: &Home, ready: &AtomicBool, stop: &AtomicBool) -> (Seen, u64) {
             }
         }
         if last {
-            return (seen, subscribers.iter().map(|s| s.missed()).sum());
+            return (seen, subscribers.iter().map(Subscriber::missed).sum());
         }
         std::thread::sleep(Duration::from_millis(5));
     }
