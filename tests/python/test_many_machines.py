@@ -261,6 +261,33 @@ def test_a_bucket_gets_what_a_folder_gets(binary: str, data: Path, tmp_path: Pat
     assert not list(tmp_path.glob("depthrig-*")), "copies are removed"
 
 
+def test_eval_reads_a_bucket_as_a_folder(binary: str, tmp_path: Path, server: str) -> None:  # noqa: F811
+    env = cloud(server, TMPDIR=str(tmp_path))
+    here = {"shards": tmp_path / "shards", "dataset": tmp_path / "dataset"}
+    make = ["--count", "6", "--size", "160x120", "--camera", "d435"]
+    assert code(binary, "scenes", *make, "--per-shard", "2", "--out", str(here["shards"]))[0] == 0
+    assert code(binary, "scenes", *make, "--dataset", str(here["dataset"]))[0] == 0
+    evaluate = ["eval", "--refine", "fill", "-q"]
+    for name, folder in here.items():
+        upload(server, folder, f"eval/{name}")
+        expected, found = (
+            code(binary, *evaluate, "--json", source, env=env) for source in (str(folder), f"s3://lab/eval/{name}")
+        )
+        assert (expected[0], found[0]) == (0, 0), (expected, found)
+        local, remote = json.loads(expected[1]), json.loads(found[1])
+        assert remote["rows"] == local["rows"] and len(local["rows"]) >= 2
+    # Each part copies what it reads; merged, they are the whole.
+    sums = [str(tmp_path / f"part{k}") for k in (0, 1)]
+    for k, path in enumerate(sums):
+        ended = code(binary, *evaluate, "s3://lab/eval/shards", "--shard", f"{k}/2", "--sums", path, env=env)
+        assert ended[0] == 0, ended
+    whole = json.loads(code(binary, *evaluate, "--json", str(here["shards"]))[1])
+    assert json.loads(code(binary, "eval", "--json", "--merge", *sums)[1])["rows"] == whole["rows"]
+    assert not list(tmp_path.glob("depthrig-*")), "copies are removed"
+    ended, _, why = code(binary, *evaluate, "s3://lab/eval", env=env)
+    assert (ended, "no object is there; name the prefix of shards or of one dataset" in why) == (1, True), why
+
+
 def test_errors_of_a_bucket_are_clear(binary: str, data: Path, tmp_path: Path, server: str) -> None:  # noqa: F811
     def fails(out: str, env: dict[str, str]) -> str:
         ended, _, why = code(binary, *SCENES, "--out", out, env=env)

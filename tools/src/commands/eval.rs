@@ -14,6 +14,7 @@ use crate::exit::{Exit, UsageError};
 use crate::out;
 use crate::outfile::{OutFile, Overwrite};
 use crate::progress::Progress;
+use crate::scratch::Scratch;
 use crate::signals::Stop;
 use anyhow::{Result, bail};
 use depthrig_bus::Intrinsics;
@@ -49,7 +50,7 @@ Examples:
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct EvalArgs {
-    /// Dataset with ground truth, shards, or folder in the layout of HAMMER
+    /// Dataset with ground truth, shards (both also s3://BUCKET/PREFIX), or folder in the layout of HAMMER
     input: Option<PathBuf>,
     /// Stream of the dataset, or folder (NAME=DIR or DIR), to evaluate; repeatable
     #[arg(long, value_name = "STREAM|[NAME=]DIR")]
@@ -129,6 +130,8 @@ pub struct EvalArgs {
     #[arg(long, value_name = "FILE")]
     library: Option<PathBuf>,
     #[command(flatten)]
+    scratch: Scratch,
+    #[command(flatten)]
     models: Models,
     /// Threads [default: all cores]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
@@ -190,7 +193,7 @@ pub fn run(args: &EvalArgs, context: &Context) -> Result<Exit> {
         let (evaluation, header) = merge::merge(&args.merge)?;
         return report(args, &outputs, &evaluation, &header, &Pictures::default());
     }
-    let source::Opened { mut source, limits, title } = source::open(args)?;
+    let source::Opened { mut source, limits, title, copy: _copy } = source::open(args, context)?;
     let rules = rules(args, limits)?;
     let cores = || std::thread::available_parallelism().map_or(1, usize::from);
     let threads = args.threads.map_or_else(cores, usize::from);

@@ -1,6 +1,7 @@
 //! Selects what `depthrig eval` reads.
 
 use super::EvalArgs;
+use crate::context::Context;
 use crate::eval::dataset::{FromDataset, Streams};
 use crate::eval::files::{Files, Named, Pairs, RAW};
 use crate::eval::scenes::Scenes;
@@ -10,6 +11,7 @@ use crate::exit::UsageError;
 use anyhow::Result;
 use depthrig_bus::StreamName;
 use depthrig_cdm::metrics::DepthRange;
+use depthrig_convert::store::Place;
 use std::path::Path;
 
 /// Images to evaluate.
@@ -20,6 +22,8 @@ pub struct Opened {
     pub limits: DepthRange,
     /// Title of the report.
     pub title: String,
+    /// The folder of copies that the images are read from, of a bucket.
+    pub copy: Option<tempfile::TempDir>,
 }
 
 /// The range of references of HAMMER and of shards.
@@ -31,12 +35,20 @@ pub const fn usual_range() -> DepthRange {
 /// Opens what the arguments name.
 ///
 /// # Errors
-/// When it is not one of the known layouts, or options do not belong to it.
-pub fn open(args: &EvalArgs) -> Result<Opened> {
+/// When it is not one of the known layouts, or options do not belong to it; and as a bucket says.
+pub fn open(args: &EvalArgs, context: &Context) -> Result<Opened> {
     let scenes = Scenes::new(&args.scenes);
     let Some(input) = &args.input else { return pairs(args, &scenes) };
     let title = input.display().to_string();
-    let opened = |source: Box<dyn Source>, limits| Ok(Opened { source, limits, title });
+    let (folder, copy) = match Place::parse(input)? {
+        Place::Local(folder) => (folder, None),
+        Place::Remote(remote) => {
+            let (folder, copy) = args.scratch.copy(&remote, context)?;
+            (folder, Some(copy))
+        }
+    };
+    let input = folder.as_path();
+    let opened = |source: Box<dyn Source>, limits| Ok(Opened { source, limits, title, copy });
     if shards::are_at(input) {
         only(
             "shards",
@@ -90,7 +102,7 @@ fn pairs(args: &EvalArgs, scenes: &Scenes) -> Result<Opened> {
         scenes,
         resize: args.resize,
     })?;
-    Ok(Opened { source: Box::new(files), limits: DepthRange::ALL, title: truth.clone() })
+    Ok(Opened { source: Box::new(files), limits: DepthRange::ALL, title: truth.clone(), copy: None })
 }
 
 /// Refuses options that a layout has no use for.
