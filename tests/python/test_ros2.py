@@ -157,9 +157,11 @@ def test_images_are_those_of_the_bus(node: Bridge, router: Router, runtime: Path
             router.hear(f"{TOP}/{name}/image_raw", IMAGE) as raw,
         ):
             messages = raw.wait(20)
-            # One may be under way.
-            until(lambda: {stamp_ns(m) for m in messages[:-1]} <= {stamp_ns(m) for m in info.messages()}, "same stamps")
+            # One may be under way. On a busy computer a message may be lost on its way to the subscriber, as these are sent at best effort.
+            until(lambda: stamp_ns(info.messages()[-1]) >= stamp_ns(messages[-2]), "as many of the other topic")
             infos = {stamp_ns(m): m for m in info.messages()}
+            lost = int((np.diff(numbers(info)) - 1).sum())
+            assert sum(stamp_ns(m) not in infos for m in messages[1:-1]) <= lost, "same stamps"
             for message in messages[1:]:
                 seen = bus.at(stamp_ns(message))
                 assert (message.encoding, message.is_bigendian) == (encoding, 0)
@@ -173,11 +175,10 @@ def test_images_are_those_of_the_bus(node: Bridge, router: Router, runtime: Path
             assert list(one.k) == [k.fx, 0, k.cx, 0, k.fy, k.cy, 0, 0, 1]
             assert list(one.p) == [k.fx, 0, k.cx, 0, 0, k.fy, k.cy, 0, 0, 0, 1, 0]
             assert (list(one.d), list(one.r)) == (list(k.coeffs[:5]), [1, 0, 0, 0, 1, 0, 0, 0, 1])
-            # Numbers of what was sent, the time of sending, and one identity. On a busy computer an image may be lost on its way to the
-            # subscriber, as images are sent at best effort: its number is missed then, and so is its frame.
-            numbers = [int.from_bytes(a[:8], "little") for a in raw.attachments[: len(messages)]]
+            # Numbers of what was sent, the time of sending, and one identity. The number of an image that was lost is missed, and so is its frame.
+            sent_as = [int.from_bytes(a[:8], "little") for a in raw.attachments[: len(messages)]]
             frames = [bus.at(stamp_ns(message)).header.sequence for message in messages[1:]]
-            assert all(1 <= sent <= taken for sent, taken in zip(np.diff(numbers[1:]), np.diff(frames), strict=True)), (numbers, frames)
+            assert all(1 <= sent <= taken for sent, taken in zip(np.diff(sent_as[1:]), np.diff(frames), strict=True)), (sent_as, frames)
             token = next(t for t in router.tokens if f"%{name}%image_raw/" in t and "/depthrig_cell/" in t)
             assert {a[16:] for a in raw.attachments} == {b"\x10" + _names.identity(token)}
             sent_ns = int.from_bytes(raw.attachments[-1][8:16], "little")
