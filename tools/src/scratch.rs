@@ -39,7 +39,8 @@ impl Scratch {
         let bytes: u64 = objects.iter().map(|(_, bytes)| bytes).sum();
         let free = shm::free_bytes(around.path())?;
         if free < bytes {
-            let (has, needed) = (free / 1_000_000, bytes.div_ceil(1_000_000));
+            let has = free / 1_000_000;
+            let needed = bytes.div_ceil(1_000_000);
             bail!(
                 "{remote} has {needed} MB, and {} has {has} MB free; name another --scratch",
                 around.path().display()

@@ -102,7 +102,7 @@ mod tests {
     use super::*;
     use depthrig_bus::Intrinsics;
 
-    /// How many of 100 pixels of one kind have depth.
+    /// Pixels with depth, of 100 of one kind.
     fn measured(surface: Surface, albedo: f32, z: f32, facing: f32) -> usize {
         let rays = Rays::new(&Intrinsics::pinhole(100.0, 100.0, 5.0, 5.0), 10, 10);
         let view = View::new(&rays, &motion::mount(0, 12));
