@@ -97,7 +97,7 @@ def dataset(binary: str, runtime: Path, tmp_path_factory: pytest.TempPathFactory
     rig = folder / "rig.toml"
     # Depth as it is, without a sensor's noise and holes.
     rig.write_text(RIG.replace("arm = true", "arm = true\ntruth = true"))
-    with arm(binary, runtime), running(binary, runtime, folder / "log", "run", str(rig), codes=(0, 3)):
+    with arm(binary, runtime), running(binary, runtime, folder / "log", "run", str(rig)):
         wait_until_rendered(binary, runtime)
         with depthrig.SignalReader("arm/action", runtime_dir=runtime, timeout=WAIT_S) as reader:
             reader.wait(timeout=WAIT_S)

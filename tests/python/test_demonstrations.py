@@ -289,7 +289,7 @@ def test_hdf5_marks_missing_images_and_the_others_are_in_their_rows(binary: str,
     text = RIG.replace("rate_hz = 5.0", "rate_hz = 15.0").replace("[[camera.stream]]", "cheap = true\n[[camera.stream]]", 1)
     begin, end = text.rsplit("rate_hz = 15.0", 1)
     rig.write_text(f"{begin}rate_hz = 6.0{end}")
-    with running(binary, runtime, tmp_path / "log", "run", str(rig), "--record", str(data), "--force", codes=(0, 3)):
+    with running(binary, runtime, tmp_path / "log", "run", str(rig), "--record", str(data), "--force"):
         deadline = time.monotonic() + WAIT_S
         while not list(data.rglob("session.toml")):
             assert time.monotonic() < deadline
@@ -367,7 +367,7 @@ def replayed(binary: str, runtime: Path, dataset: Path, log: Path) -> list[tuple
 
     call = ["replay", str(dataset), "--as-fast-as-possible", "--paused", "-q"]
     images = {"color": "top/color", "depth": "top/depth"}
-    with running(binary, runtime, log, *call, codes=(0, 3)):
+    with running(binary, runtime, log, *call):
         deadline = time.monotonic() + WAIT_S
         while not (runtime / "cell.sock").exists():
             assert time.monotonic() < deadline
@@ -402,7 +402,7 @@ def test_a_policy_sees_the_same_twice_in_a_replay(
 def test_a_gap_is_named_and_refused_or_masked(binary: str, runtime: Path, tmp_path: Path) -> None:  # noqa: F811
     rig = tmp_path / "rig.toml"
     rig.write_text(RIG.replace("[[camera.stream]]", "cheap = true\n[[camera.stream]]", 1))
-    with running(binary, runtime, tmp_path / "log", "run", str(rig), codes=(0, 3)):
+    with running(binary, runtime, tmp_path / "log", "run", str(rig)):
         wait_until_rendered(binary, runtime)
         recording = depthrig.Recording("cell", runtime)
         with arm(binary, runtime):

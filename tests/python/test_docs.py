@@ -62,7 +62,7 @@ def test_the_reference_has_the_rig_file_and_every_call_type_and_metric(
 ) -> None:
     rig = tmp_path / "rig.toml"
     rig.write_text('rig = "described"\n' + SIMULATED.format(name="front"))
-    with running(binary, runtime, tmp_path / "log", "run", str(rig), codes=CODES):
+    with running(binary, runtime, tmp_path / "log", "run", str(rig)):
         where = address(binary, runtime, "described")
         def get(path: str) -> str:
             connection = http.client.HTTPConnection("127.0.0.1", where.port, timeout=WAIT_S)
@@ -186,7 +186,7 @@ def test_the_tutorial_leads_to_a_dataset(binary: str, bench: Path, runtime: Path
     sh(take("depthrig --version"))
     sh(take("depthrig config check"))
     replayed, live = blocks(TUTORIAL, "python")
-    with running(binary, runtime, bench / "log", *shlex.split(take("depthrig run"))[1:2], str(bench / "first.toml"), codes=CODES):
+    with running(binary, runtime, bench / "log", *shlex.split(take("depthrig run"))[1:2], str(bench / "first.toml")):
         where = address(binary, runtime, "first")
         until(lambda: json.loads(sh("depthrig status --json", CODES))["preparing"] is None)
         assert "front/depth  streaming" in sh(take("depthrig status"), CODES)
@@ -209,7 +209,7 @@ def test_the_tutorial_leads_to_a_dataset(binary: str, bench: Path, runtime: Path
     assert list((bench / "images").rglob("*.jpg")) + list((bench / "images").rglob("*.png"))
     dataset = next((bench / "datasets").glob("*_kitchen"))
     assert take("depthrig replay") == "depthrig replay datasets/*_kitchen --loop"
-    with running(binary, runtime, bench / "replay", "replay", str(dataset), "--loop", codes=CODES):
+    with running(binary, runtime, bench / "replay", "replay", str(dataset), "--loop"):
         assert python(replayed).count("(480, 640)") == 5
     sh(take("depthrig cameras"))
     sh(take("depthrig doctor"), (0, 1, 3))

@@ -101,7 +101,7 @@ class Rig:
 def rig(binary: str, runtime: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
     folder = tmp_path_factory.mktemp("lab")
     (folder / "lab.toml").write_text(RIG + SIMULATED.format(name="front") + FAULT + files_camera("still", pattern(folder / "still")))
-    with running(binary, runtime, folder / "log", "run", str(folder / "lab.toml"), "-q", codes=(0, 3)):
+    with running(binary, runtime, folder / "log", "run", str(folder / "lab.toml"), "-q"):
         where = address(binary, runtime, "lab")
         rig = Rig(where.origin, where.token, folder)
 

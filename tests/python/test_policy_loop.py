@@ -97,7 +97,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @contextmanager
 def live(binary: str, runtime: Path, rig: Path) -> Iterator[subprocess.Popen[bytes]]:
-    with running(binary, runtime, rig / "log", "run", str(rig / "rig.toml"), "-q", codes=(0, 3)) as process:
+    with running(binary, runtime, rig / "log", "run", str(rig / "rig.toml"), "-q") as process:
         with depthrig.SetReader(IMAGES.values(), runtime_dir=runtime, timeout=WAIT_S, max_skew=1.0) as reader:
             reader.next(timeout=WAIT_S)
         yield process
@@ -197,7 +197,7 @@ def replayed(
         time.sleep(pause_s)
 
     call = ["replay", str(dataset), "--as-fast-as-possible", "--paused", "-q", *(["--loop"] if steps else [])]
-    with running(binary, runtime, log, *call, codes=(0, 3)), loop(runtime, **options) as policy_loop:
+    with running(binary, runtime, log, *call), loop(runtime, **options) as policy_loop:
         until = time.monotonic() + WAIT_S
         while not (runtime / "policy.sock").exists():
             assert time.monotonic() < until

@@ -207,7 +207,7 @@ def rig(rig_file: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path,
 def recorded(binary: str, runtime: Path, rig: tuple[Path, Path]) -> Recorded:  # noqa: F811
     """A recording during which one signal appears, and one has its publisher killed and another one come."""
     path, folder = rig
-    with running(binary, runtime, folder / "log", "run", str(path), codes=(0, 3)), publishing(runtime) as robot:
+    with running(binary, runtime, folder / "log", "run", str(path)), publishing(runtime) as robot:
         wait_until_known(robot)
         dataset = record(binary, runtime, folder, "whole")
         wait_for_sets(binary, runtime, 3)
@@ -391,7 +391,7 @@ def test_replay_publishes_every_sample_again(binary: str, runtime: Path, recorde
     again = tmp_path / "again"
     call = ["replay", str(recorded.dataset), "--paused", "--record", str(again)]
     got: dict[int, bytes] = {}
-    with running(binary, runtime, tmp_path / "log", *call, codes=(0, 3)) as process:
+    with running(binary, runtime, tmp_path / "log", *call) as process:
         wait_until_recording(binary, runtime)
         reader = open_reader(runtime, "arm/joint_position")
         command(binary, runtime, "replay", "resume")
@@ -426,7 +426,7 @@ def test_ten_kilohertz_are_recorded_and_what_a_stopped_daemon_misses_is_counted(
 ) -> None:
     path, folder = rig
     with (
-        running(binary, runtime, folder / "fast.log", "run", str(path), codes=(0, 3)) as daemon,
+        running(binary, runtime, folder / "fast.log", "run", str(path)) as daemon,
         publisher(runtime, "fast/joints", "a,b", 10_000),
     ):
         dataset = record(binary, runtime, folder, "fast")
@@ -452,7 +452,7 @@ def test_ten_kilohertz_are_recorded_and_what_a_stopped_daemon_misses_is_counted(
 def test_a_publisher_with_other_fields_is_refused_by_name(binary: str, runtime: Path, rig: tuple[Path, Path]) -> None:  # noqa: F811
     path, folder = rig
     log = folder / "changed.log"
-    with running(binary, runtime, log, "run", str(path), codes=(0, 3)):
+    with running(binary, runtime, log, "run", str(path)):
         with publisher(runtime, "late/joints", "a,b", 100):
             dataset = record(binary, runtime, folder, "changed")
             wait_for_sets(binary, runtime, 3)
@@ -479,7 +479,7 @@ def test_a_recording_begins_with_the_second_before_and_the_last_sample_however_o
         return sum(s["samples"] for s in said if s["signal"] == name)
 
     with (
-        running(binary, runtime, folder / "before.log", "run", str(path), codes=(0, 3)),
+        running(binary, runtime, folder / "before.log", "run", str(path)),
         depthrig.Signal("slow/mode", ["mode"], runtime_dir=runtime) as slow,
         publisher(runtime, "fast/before", "a,b", 100),
     ):
@@ -516,7 +516,7 @@ def test_a_signal_with_the_name_of_a_stream_is_refused_once_and_costs_nothing(
 ) -> None:
     path, folder = rig
     log = folder / "clash.log"
-    with running(binary, runtime, log, "run", str(path), codes=(0, 3)):
+    with running(binary, runtime, log, "run", str(path)):
         wait_until_running(binary, runtime)
         dataset = record(binary, runtime, folder, "clash")
         stream = tomllib.loads((dataset / "session.toml").read_text())["streams"][0]["id"]
@@ -587,7 +587,7 @@ def test_a_required_signal_must_come_before_a_recording_begins(
             time.sleep(0.1)
 
     log = tmp_path / "log"
-    with running(binary, runtime, log, "run", str(path), codes=(0, 3)):
+    with running(binary, runtime, log, "run", str(path)):
         missing = the_signal(3)
         assert (missing["signal"], missing["state"], missing["age_s"]) == ("late/joints", "missing", None)
         call = [binary, "record", "start", "--force"]
@@ -611,7 +611,7 @@ def test_a_required_signal_must_come_before_a_recording_begins(
     # `run --record` waits for it.
     again = tmp_path / "again"
     call = ["run", str(path), "--record", str(again), "--force"]
-    with running(binary, runtime, tmp_path / "again.log", *call, codes=(0, 3)):
+    with running(binary, runtime, tmp_path / "again.log", *call):
         the_signal(3)
         assert not again.exists()
         with publisher(runtime, "late/joints", "a,b", 100):

@@ -23,7 +23,6 @@ SIXEL_ERROR = 24
 """The same with a palette of 128 colours, whose levels are percent."""
 HOLE_COLOR = (0x26, 0x28, 0x2C)
 IMAGE = re.compile("▀".encode() + rb"|\x1bP0;1;0q|\x1b_Ga=T")
-CODES = (0, 3)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -33,7 +32,7 @@ def rig(binary: str, runtime: Path, tmp_path_factory: pytest.TempPathFactory) ->
     text = '[recording]\ndirectory = "datasets"\nreserve_mb = 64\n' + files_camera("still", manifest) + SIMULATED.format(name="moving")
     file = folder / "rig.toml"
     file.write_text(f'rig = "top"\n{text}')
-    with running(binary, runtime, folder / "log", "run", str(file), codes=CODES):
+    with running(binary, runtime, folder / "log", "run", str(file)):
         deadline = time.monotonic() + WAIT_S
         while "still/depth" not in command(binary, runtime, "status", codes=(0, 1, 3)):
             assert time.monotonic() < deadline
@@ -160,7 +159,7 @@ def test_screens_of_any_size_are_taken(binary: str, runtime: Path) -> None:
 def test_the_end_of_the_rig_is_an_error_on_a_terminal_given_back(binary: str, runtime: Path, tmp_path: Path) -> None:
     rig = tmp_path / "rig.toml"
     rig.write_text('rig = "short"\n' + SIMULATED.format(name="front"))
-    with running(binary, runtime, tmp_path / "log", "run", str(rig), codes=CODES):
+    with running(binary, runtime, tmp_path / "log", "run", str(rig)):
         deadline = time.monotonic() + WAIT_S
         while "front/color" not in command(binary, runtime, "status", "--rig", "short", codes=(0, 1, 3)):
             assert time.monotonic() < deadline

@@ -15,7 +15,7 @@ use depthrig_usb as usb;
 use depthrig_usb::SysRoot;
 use depthrig_usb::video::ImageSource;
 use depthrig_v4l2::{FourCc, Node, Source as KernelSource, Wanted};
-use emulator::Options;
+use emulator::{Fault, Options};
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
@@ -126,16 +126,26 @@ fn stream_for_ever(port: &str) -> anyhow::Result<()> {
     }
 }
 
+/// kill -9 while transfers wait for data and none is half received, which would stop a guest of one processor for good
+/// (`tests/vm/README.md`, "Consequences of the guest's single processor").
+fn kill(device: &emulator::Camera, mut child: Child) -> anyhow::Result<()> {
+    device.fault(Fault::Nak)?;
+    // What was sent before has been read.
+    std::thread::sleep(Duration::from_millis(50));
+    child.kill()?;
+    child.wait()?;
+    Ok(device.fault(Fault::Clear)?)
+}
+
 /// kill -9 in the middle of transfers. The kernel takes them back by itself and leaves the interfaces without a driver;
 /// one call binds it again.
 fn killed(checks: &mut Checks, device: &emulator::Camera, truth: &mut Truth) -> anyhow::Result<()> {
-    let mut child = child(device)?;
+    let child = child(device)?;
     let error = Camera::open(&SysRoot::default(), &usb_device(device)?).err();
     let text = error.as_ref().map_or_else(String::new, ToString::to_string);
     checks.equal("held by another program through libusb", error.map(|e| e.kind()), Some(ErrorKind::Busy));
     checks.that("the message names it", text.contains(&format!("process {}", child.id())), text);
-    child.kill()?;
-    child.wait()?;
+    kill(device, child)?;
     std::thread::sleep(Duration::from_millis(300));
     checks.equal(
         "after kill -9 the kernel does not bind its driver by itself",
@@ -148,9 +158,8 @@ fn killed(checks: &mut Checks, device: &emulator::Camera, truth: &mut Truth) -> 
     checks.equal("a second call has nothing to do", give_to_kernel(&root, &usb_device(device)?)?, 0);
     kernel_streams(checks, device, truth, "after kill -9")?;
     // And by itself, when the backend next opens the camera through the kernel.
-    let mut third = self::child(device)?;
-    third.kill()?;
-    third.wait()?;
+    let third = self::child(device)?;
+    kill(device, third)?;
     let port = device.port_path();
     let transport = TransportChoice::Kernel;
     let backend = RealsenseBackend::new(RealsenseConfig { port, transport, ..RealsenseConfig::default() });
@@ -158,9 +167,8 @@ fn killed(checks: &mut Checks, device: &emulator::Camera, truth: &mut Truth) -> 
     checks.that("the backend binds the driver itself", opened.is_ok(), format!("{opened:?}"));
     nodes_become(6);
     // The same once more, and straight into libusb again.
-    let mut again = self::child(device)?;
-    again.kill()?;
-    again.wait()?;
+    let again = self::child(device)?;
+    kill(device, again)?;
     let camera = Camera::open(&root, &usb_device(device)?)?;
     let mut source = Source::start(&camera, &[small(DEPTH)], Settings::default())?;
     let seen = take(device, truth, &mut source, &["depth"], 3)?;
@@ -196,7 +204,7 @@ fn memory(checks: &mut Checks, device: &emulator::Camera, truth: &mut Truth) -> 
     std::fs::write(LIMIT, "2")?;
     let other = emulator::Camera::plug("d435", Options::default())?;
     nodes_become(12);
-    let mut child = child(&other)?;
+    let child = child(&other)?;
     let camera = Camera::open(&root, &usb_device(device)?)?;
     let error = Source::start(&camera, &[small(DEPTH), small(COLOR)], Settings::default()).err();
     let text = error.as_ref().map_or_else(String::new, ToString::to_string);
@@ -205,8 +213,7 @@ fn memory(checks: &mut Checks, device: &emulator::Camera, truth: &mut Truth) -> 
         text.contains("the limit is 2 MB for all programs"),
         &text,
     );
-    child.kill()?;
-    child.wait()?;
+    kill(&other, child)?;
     let mut source = Source::start(&camera, &[small(DEPTH), small(COLOR)], Settings::default())?;
     let seen = take(device, truth, &mut source, &["depth", "color"], 2)?;
     checks.that(
