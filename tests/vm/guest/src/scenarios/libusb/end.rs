@@ -137,7 +137,7 @@ fn kill(device: &emulator::Camera, mut child: Child) -> anyhow::Result<()> {
     Ok(device.fault(Fault::Clear)?)
 }
 
-/// kill -9 in the middle of transfers. The kernel takes them back by itself and leaves the interfaces without a driver;
+/// kill -9 while transfers wait. The kernel takes them back by itself and leaves the interfaces without a driver;
 /// one call binds it again.
 fn killed(checks: &mut Checks, device: &emulator::Camera, truth: &mut Truth) -> anyhow::Result<()> {
     let child = child(device)?;
