@@ -203,6 +203,14 @@ if [ "$skipped" -gt 0 ]; then
     printf '\nskipped:\n'
     sed 's/^/  /' "$DEPTHRIG_TEST_SKIPS"
 fi
+# Whoever sees the end of the output alone finds there what failed, and why.
+for name in $failed_steps; do
+    printf '\n%s failed:\n' "$name"
+    {
+        grep -E '^(FAILED|ERROR|vm: FAIL|vm: BROKEN:) ' "$logs/$name.log" || tail -n 3 "$logs/$name.log"
+        grep '^E  ' "$logs/$name.log"
+    } | head -n 12 | cut -c 1-300 | sed 's/^/  /'
+done
 [ -z "$failed_steps" ] || printf '\nfailed: %s\n' "$failed_steps"
 [ -z "$failed_steps" ] || [ "$failed" -gt 0 ] || failed=1
 printf '\n%d passed, %d failed%s\n' "$passed" "$failed" "$([ "$skipped" -eq 0 ] || echo ", $skipped skipped (named above)")"

@@ -38,6 +38,7 @@ RESULT = re.compile(r"^test (?P<name>.+?) \.\.\. (?P<result>ok|FAILED|ignored.*)
 ENDED = re.compile(r"^test result: .* (?P<filtered>\d+) filtered out")
 OUTPUT = re.compile(r"^---- (?P<name>.+?) stdout ----$")
 SKIPPED = re.compile(r"^\s*skipped: ", re.IGNORECASE)
+PANICKED = re.compile(r"^thread .* panicked at (?P<place>.+):\d+:$")
 
 
 @dataclass
@@ -98,7 +99,7 @@ class Outcome:
 class Totals:
     """Results of an executable."""
 
-    failed: int = 0
+    failed: list[str] = field(default_factory=list)
     skipped: list[str] = field(default_factory=list)
 
 
@@ -173,7 +174,18 @@ def results_of(executable: Executable, box: Box, filters: list[str], programs: d
     took = time.monotonic() - started
     line = f"test result: {word}. {passed} passed; {len(failed)} failed; {ignored} ignored; {len(skipped)} skipped"
     print(f"{line}; {took:.1f} s: {executable.name}", flush=True)
-    return Totals(len(failed), [f"{executable.crate} {name}: {why}" for name, why in skipped])
+    return Totals(
+        [f"{executable.crate} {name} - {reason(outcome.output.get(name, []))}" for name in failed],
+        [f"{executable.crate} {name}: {why}" for name, why in skipped],
+    )
+
+
+def reason(output: list[str]) -> str:
+    """The place of a test's first panic, and the first lines of its message."""
+    for at, line in enumerate(output):
+        if found := PANICKED.match(line):
+            return f"{found['place']}: " + " ".join(line.strip() for line in output[at + 1 : at + 4])
+    return "no panic in its output"
 
 
 def main() -> int:
@@ -201,6 +213,7 @@ def main() -> int:
         wanted += [(e, ([name] if name else []) + skips) for e in found]
     box = Box(shm_mib=args.shm, nofile=args.nofile, busy=args.busy)
     failures: list[str] = []
+    failed: list[str] = []
     skipped: list[str] = []
     # Processes, not threads: a box kills all descendants of its process.
     with ProcessPoolExecutor(args.jobs, mp_context=get_context("fork")) as pool:
@@ -209,6 +222,7 @@ def main() -> int:
             text, totals = ended.result()
             print(text, end="", flush=True)
             skipped += totals.skipped
+            failed += totals.failed
             if totals.failed:
                 failures.append(executable.name)
     for line in skipped:
@@ -216,6 +230,9 @@ def main() -> int:
     if (path := os.environ.get("DEPTHRIG_TEST_SKIPS")) and skipped:
         with open(path, "a") as file:
             file.writelines(f"{line}\n" for line in skipped)
+    for line in failed:
+        # As pytest has it: tools/test.sh shows these lines once more at its end.
+        print(f"FAILED {line}")
     if failures:
         print(f"failed: {', '.join(failures)}")
     return 1 if failures or not wanted else 0

@@ -143,6 +143,19 @@ def test_a_rust_test_that_takes_the_others_with_it_is_a_failure(tmp_path: Path) 
     assert "memory allocation failed" in done.stdout
 
 
+PANICS = r"""
+printf 'failures:\n\n---- hangs stdout ----\n\nthread '"'hangs'"' (7) panicked at tests/it.rs:5:9:\n'
+printf 'assertion failed: left\n  left: 1\n right: 2\nnote: run with it\n\n'
+"""
+
+
+def test_a_failed_rust_test_is_named_with_its_place_and_message(tmp_path: Path) -> None:
+    script = f'echo "test a ... ok"; echo "test hangs ... FAILED"\n{PANICS}\n{ENDED % "FAILED"}; exit 101'
+    done = run(RUST, fake(tmp_path, script))
+    assert done.returncode == 1
+    assert "FAILED fake hangs - tests/it.rs:5: assertion failed: left left: 1 right: 2\n" in done.stdout
+
+
 ENDED = 'echo "test result: %s. 1 passed; 1 failed; 0 ignored; 0 measured; 0 filtered out; finished in 0.00s"'
 NO_DATA = f"""
 echo "test a ... ok"; echo "test hangs ... FAILED"
