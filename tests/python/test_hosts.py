@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 import tomllib
 from collections.abc import Iterator, Sequence
@@ -126,12 +127,14 @@ def two_computers(binary: str, folder: Path, rate: str = "1gbit", **more: Any) -
     """Both computers, joined by a wire of `rate`, with `more` of their rig."""
     if why := why_not():
         pytest.skip(why)
-    runtime = Path(subprocess.run(["mktemp", "-d", "/tmp/hXXXX"], capture_output=True, text=True, check=True).stdout.strip())
-    # The server's user is another one where the tests run as root.
-    for path in (folder, runtime):
-        os.chmod(path, 0o700)
-    with TwoHosts(folder, SHIFT_NS, rate) as hosts:
-        yield Rig(hosts, binary, folder, runtime, **more)
+    # Short: sockets lie below it.
+    with tempfile.TemporaryDirectory(prefix="h", dir="/tmp", ignore_cleanup_errors=True) as name:
+        runtime = Path(name)
+        # The server's user is another one where the tests run as root.
+        for path in (folder, runtime):
+            os.chmod(path, 0o700)
+        with TwoHosts(folder, SHIFT_NS, rate) as hosts:
+            yield Rig(hosts, binary, folder, runtime, **more)
 
 
 @pytest.fixture

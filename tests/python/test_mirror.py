@@ -91,6 +91,7 @@ def both(rig: Rig, stream: str, count: int) -> list[tuple[Any, np.ndarray, Any, 
                 original = originals.get(frame.header.device_sequence)
                 if original is not None:
                     out.append((frame.header, np.array(frame.array), *original))
+                    deadline = time.monotonic() + WAIT_S
     return out
 
 
