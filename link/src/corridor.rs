@@ -24,7 +24,7 @@ const MAX_RATE: f64 = 1e-3;
 const WANDER: f64 = 2e-6;
 /// Points that are closer together do not speak for a rate other than that of a good crystal, nanoseconds.
 const LEVER: f64 = 2e8;
-/// Exchanges kept to begin the corridor anew: three seconds at 20 Hz.
+/// Exchanges kept to begin the corridor anew, and heard after a bend that may be a step: three seconds at 20 Hz.
 const RECENT: usize = 64;
 /// Halvings of the range of rates: to 1e-15.
 const STEPS: usize = 40;
@@ -141,6 +141,19 @@ pub struct Corridor {
     newest: i64,
     lines: Option<Lines>,
     epoch: u32,
+    bend: Option<Bend>,
+}
+
+/// A bend that may be a step: the exchange beside the old lines took so long that those that fit it say little.
+#[derive(Debug)]
+struct Bend {
+    before: Estimate,
+    /// Local time of the bend.
+    at: i64,
+    /// By how much a slewed clock may have left the old lines by then, nanoseconds.
+    slewed: u64,
+    /// Exchanges that may still show a step.
+    left: usize,
 }
 
 impl Default for Corridor {
@@ -155,6 +168,7 @@ impl Default for Corridor {
             newest: i64::MIN,
             lines: None,
             epoch: 0,
+            bend: None,
         }
     }
 }
@@ -187,8 +201,7 @@ impl Corridor {
         if !e.is_possible() || e.t1 <= self.asked {
             return Taken::Refused;
         }
-        let t4 = HostTime::from_ns(e.t4);
-        let expected = self.at(t4);
+        let before = self.estimate();
         if self.recent.len() == RECENT {
             self.recent.pop_front();
         }
@@ -196,7 +209,7 @@ impl Corridor {
         if self.lines.is_some() {
             self.push(e);
             if self.find() {
-                return Taken::Fits;
+                return self.settle();
             }
         }
         // No line fits: the newest exchanges that one does fit are the new corridor.
@@ -207,25 +220,56 @@ impl Corridor {
             from -= 1;
         }
         self.begin(&all, from);
+        // An older exchange would have shown a clock that was off by more than its round trip.
+        let older = all.range(..all.len() - 1);
+        let slewed = older.map(|old| old.round_trip_ns().cast_unsigned() + slew_ns(old.t4, e.t4)).min();
         self.recent = all;
         self.recent.drain(..from);
-        let now = self.at(t4);
-        // A slewed clock is off by a round trip at most before it is noticed.
-        let slack = self.recent.iter().map(|e| e.round_trip_ns().cast_unsigned()).min().unwrap_or(0);
-        let went_on = expected.zip(now).is_some_and(|(old, new)| {
-            let bound = old.uncertainty_ns.saturating_add(new.uncertainty_ns).saturating_add(slack);
-            old.offset_ns.abs_diff(new.offset_ns) <= bound
-        });
-        if went_on {
-            return Taken::Bent;
+        let first =
+            before.zip(slewed).map(|(before, slewed)| Bend { before, at: e.t4, slewed, left: RECENT });
+        match self.bend.take().or(first) {
+            Some(bend) if self.went_on(&bend) => {
+                self.bend = Some(Bend { left: RECENT, ..bend });
+                Taken::Bent
+            }
+            _ => {
+                self.epoch = self.epoch.saturating_add(1);
+                Taken::Stepped
+            }
         }
+    }
+
+    /// After an exchange that fits: whether it shows that the last bend was a step.
+    fn settle(&mut self) -> Taken {
+        let Some(bend) = self.bend.take() else { return Taken::Fits };
+        if self.went_on(&bend) {
+            self.bend = bend.left.checked_sub(1).map(|left| Bend { left, ..bend });
+            return Taken::Fits;
+        }
+        // Those before it may have been on their way when the clock stepped.
+        self.recent.drain(..self.recent.len() - 1);
+        let newest = core::mem::take(&mut self.recent);
+        self.begin(&newest, 0);
+        self.recent = newest;
         self.epoch = self.epoch.saturating_add(1);
         Taken::Stepped
+    }
+
+    /// Whether the offset may be where the lines before a bend led, by a clock that was slewed.
+    fn went_on(&self, bend: &Bend) -> bool {
+        let here = HostTime::from_ns(self.newest);
+        self.at(here).is_some_and(|now| {
+            let old = bend.before.at(here);
+            let bound = [now.uncertainty_ns, bend.slewed, slew_ns(bend.at, self.newest)];
+            let bound = bound.iter().fold(old.uncertainty_ns, |sum, more| sum.saturating_add(*more));
+            old.offset_ns.abs_diff(now.offset_ns) <= bound
+        })
     }
 
     /// Forgets every exchange: the next one begins an epoch.
     pub fn restart(&mut self) {
         self.lines = None;
+        self.bend = None;
         self.recent.clear();
     }
 
@@ -323,6 +367,13 @@ impl Corridor {
         let low = self.below.support(-slope)?;
         Some((Line { x0: low.x0, d0: -low.d0, slope }, high))
     }
+}
+
+/// By how much a clock may leave its line in this local time: rates of [`MAX_RATE`] to both sides, for [`WINDOW`] at most, as
+/// what was away for longer may as well have stepped.
+fn slew_ns(from: i64, to: i64) -> u64 {
+    let slewed = to.saturating_sub(from).clamp(0, WINDOW.as_nanos() as i64);
+    (slewed as f64 * 2.0 * MAX_RATE).ceil() as u64
 }
 
 #[cfg(test)]

@@ -37,7 +37,7 @@ VECTORS = {
     "action": [("action/values", "fields")],
 }
 """Topics and fields of the arm's vectors."""
-GAPS = ("--max-gap", "2")
+GAPS = ("--max-gap", "2s")
 """On a busy computer the arm's process may be late by more than the 0.2 s that an export allows by itself."""
 RIG = """
 rig = "cell"

@@ -22,6 +22,7 @@ import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
+from itertools import takewhile
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -184,7 +185,8 @@ def reason(output: list[str]) -> str:
     """The place of a test's first panic, and the first lines of its message."""
     for at, line in enumerate(output):
         if found := PANICKED.match(line):
-            return f"{found['place']}: " + " ".join(line.strip() for line in output[at + 1 : at + 4])
+            message = takewhile(lambda line: not line.startswith(("stack backtrace:", "note: ")), output[at + 1 : at + 4])
+            return f"{found['place']}: " + " ".join(line.strip() for line in message)
     return "no panic in its output"
 
 

@@ -80,18 +80,19 @@ fn a_frame_takes_no_memory() {
     };
     // The clock map takes its memory in its first seconds.
     run(&mut stream, &mut sink, 1500);
-    let before = of_thread();
-    let began = HostTime::now();
-    let looks = run(&mut stream, &mut sink, FRAMES);
-    let taken = of_thread() - before;
     // Each heart-beat of the daemon's side takes one: what iceoryx2 shares between a loan and its port. Reading the
     // lock of a silent process takes nine or so. Found by the traces of all that was taken; nothing else was.
-    let beats = began.elapsed().as_secs_f64() / HEARTBEAT.as_secs_f64();
-    let others = beats as u64 + 1 + LOOK * looks;
-    assert!(
-        others < FRAMES / 2,
-        "the computer is so slow that this says nothing: {beats} heart-beats, {looks} looks"
-    );
+    let mut measure = || {
+        let before = of_thread();
+        let began = HostTime::now();
+        let looks = run(&mut stream, &mut sink, FRAMES);
+        let taken = of_thread() - before;
+        let beats = began.elapsed().as_secs_f64() / HEARTBEAT.as_secs_f64();
+        (taken, beats, looks, beats as u64 + 1 + LOOK * looks)
+    };
+    // Says nothing where a busy computer makes the others as many as the frames.
+    let told = (0..10).map(|_| measure()).find(|(.., others)| *others < FRAMES / 2);
+    let (taken, beats, looks, others) = told.expect("a computer that is not so slow");
     assert!(
         taken <= others,
         "{FRAMES} frames, {beats:.0} heart-beats and {looks} looks between them: memory was taken {taken} times"

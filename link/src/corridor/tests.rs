@@ -171,6 +171,53 @@ fn a_clock_that_is_slewed_bends_the_line_without_a_new_epoch() {
     }
 }
 
+/// A busy computer: the exchange that shows the change has been on its way for longer than the change is large.
+#[test]
+fn a_step_behind_a_long_exchange_begins_an_epoch_and_a_slewed_clock_does_not() {
+    for step in [100 * MS, -100 * MS, 20 * MS] {
+        for (there, back) in [(150 * MS, MS), (MS, 150 * MS), (110 * MS, 90 * MS)] {
+            let clocks = Clocks { offset: 5_000_000_000, rate: 3e-6 };
+            let mut corridor = Corridor::default();
+            let end = run(&mut corridor, &clocks, 0, false, &mut Vec::new());
+            let stepped = Clocks { offset: clocks.offset + step, ..clocks };
+            let mut taken = vec![corridor.take(stepped.exchange(end, there, 15_000, back))];
+            run(&mut corridor, &stepped, end + 250 * MS, false, &mut taken);
+            assert!(taken[..2].contains(&Taken::Stepped), "{step} ns, {there} + {back}: {taken:?}");
+            assert_eq!(corridor.at(HostTime::from_ns(end)).unwrap().epoch, 2);
+        }
+    }
+    for (there, back) in [(3 * MS, 0), (0, 3 * MS), (150 * MS, MS)] {
+        let mut clocks = Clocks { offset: 7, rate: 3e-6 };
+        let mut corridor = Corridor::default();
+        let mut end = run(&mut corridor, &clocks, 0, false, &mut Vec::new());
+        let mut taken = Vec::new();
+        for rate in [500e-6, -500e-6, 0.0] {
+            clocks = Clocks { offset: (clocks.offset_at(end) - rate * end as f64).round() as i64, rate };
+            for k in 0..10 {
+                taken.push(corridor.take(clocks.exchange(end + k * 250 * MS, there, 15_000, back)));
+            }
+            end = run(&mut corridor, &clocks, end + 2_750 * MS, true, &mut taken);
+        }
+        assert!(
+            taken.contains(&Taken::Bent) && !taken.contains(&Taken::Stepped),
+            "{there} + {back}: {taken:?}"
+        );
+    }
+}
+
+#[test]
+fn a_step_while_nothing_came_begins_an_epoch() {
+    for (there, back) in [(20_000, 20_000), (150 * MS, MS)] {
+        let clocks = Clocks { offset: 0, rate: 0.0 };
+        let mut corridor = Corridor::default();
+        let end = run(&mut corridor, &clocks, 0, false, &mut Vec::new()) + 60_000 * MS;
+        let stepped = Clocks { offset: 100 * MS, ..clocks };
+        let mut taken = vec![corridor.take(stepped.exchange(end, there, 15_000, back))];
+        run(&mut corridor, &stepped, end + 250 * MS, false, &mut taken);
+        assert!(taken[..2].contains(&Taken::Stepped), "{there} + {back}: {taken:?}");
+    }
+}
+
 #[test]
 fn stamps_that_cannot_be_true_change_nothing() {
     let mut corridor = Corridor::default();

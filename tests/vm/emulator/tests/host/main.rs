@@ -173,7 +173,8 @@ fn frames_and_damage() {
         assert_eq!((header.len(), header[1] & 0xFE), (232, 0x8E));
         let stamp = Stamp::read(&body).unwrap();
         assert_eq!(body, camera.expected("depth", stamp.index).unwrap());
-        assert!(last.is_none_or(|last| stamp.index == last + 1));
+        // A host that a busy computer holds up misses some.
+        assert!(last.is_none_or(|last| stamp.index > last));
         last = Some(stamp.index);
     }
     let length = 640 * 480 * 2;
