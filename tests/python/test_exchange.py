@@ -42,7 +42,8 @@ def test_real_images_come_back_as_they_were(binary: str, runtime: Path, rig_file
     calibration = json.loads((session / "calibration.json").read_text())
     described = {s["id"]: s for s in calibration["streams"]}
     with (session / "frames.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+        # A frame that its set lacks has no file.
+        rows = [row for row in csv.DictReader(file) if row["file"]]
     assert len(rows) == report["frames"]
     # The images of the first and the last set, as another decoder sees them.
     for row in (r for r in rows if r["n"] in {"0", str(report["sets"] - 1)}):

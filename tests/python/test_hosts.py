@@ -22,7 +22,7 @@ from typing import Any
 import pytest
 from test_daemon import CAMERAS, DATA, ROOT, WAIT_S, binary  # noqa: F401
 from test_link_clock import SHIFT_NS
-from test_two_hosts import messages
+from test_two_hosts import PERIOD_NS, messages
 
 sys.path.insert(0, str(ROOT / "tests/link"))
 from hosts import TwoHosts, wait_for, why_not
@@ -202,7 +202,9 @@ def test_one_start_records_both_and_their_parts_become_one_dataset(rig: Rig) -> 
     # The other one began a little before the recorder, and ended a little after it.
     both = [t - SHIFT_NS for t in ticks[part] if ticks[own][0] <= t - SHIFT_NS <= ticks[own][-1]]
     assert len(both) >= 15
-    nearest = [min(abs(t - other) for other in ticks[own]) for t in both]
+    # A busy computer may leave out a set of its own: the tick before or after it is on the grid as well.
+    near = [[t - other for other in ticks[own] if abs(t - other) < 1.5 * PERIOD_NS] for t in both]
+    nearest = [min(min(apart % PERIOD_NS, -apart % PERIOD_NS) for apart in of_tick) for of_tick in near]
     assert max(nearest) < 15_000_000, nearest
     assert sorted(nearest)[len(nearest) // 2] < 5_000_000, nearest
     # By hand the same comes out again, and nothing that exists is overwritten.

@@ -335,7 +335,7 @@ def test_the_real_loader_finds_the_same(binary: str, golden: Golden, recorded: P
     """The expectations are handed over as files, because the loader's Python has no reader of ours nor of MCAP."""
     real = [CAMERAS[0], CAMERAS[-1]]
     chosen = [f"--stream={camera.name}/{stream}" for camera in real for stream in ("color", "depth")]
-    command, lengths = [str(LOADER), str(Path(__file__).with_name("lerobot_loader.py"))], []
+    command, lengths, blank = [str(LOADER), str(Path(__file__).with_name("lerobot_loader.py"))], [], []
     for name, arguments in (("golden", [golden.dataset] * 2), ("real", [*chosen, recorded])):
         out, expected = tmp_path / name, tmp_path / f"{name}.expected"
         export(binary, *arguments, out)
@@ -354,6 +354,8 @@ def test_the_real_loader_finds_the_same(binary: str, golden: Golden, recorded: P
         command += [str(out), str(expected)]
         table = pq.read_table(out / "meta" / "episodes" / "chunk-000" / "file-000.parquet")
         lengths.append(table.column("length").to_pylist())
+        rows = [row for file in (out / "data").rglob("*.parquet") for row in pq.read_table(file).to_pylist()]
+        blank.append(sum(bool(value) for row in rows for key, value in row.items() if key.startswith("missing.")))
     env = {**os.environ, "HF_HOME": str(tmp_path / "hf"), "HF_HUB_OFFLINE": "1"}
     done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -361,5 +363,6 @@ def test_the_real_loader_finds_the_same(binary: str, golden: Golden, recorded: P
     assert len(said) == 2
     for found, episodes in zip(said, lengths, strict=True):
         assert (found["frames"], found["episodes"], found["fps"]) == (sum(episodes), len(episodes), 5)
-    # All but the two blank ones; four of each row.
-    assert [s["images_compared"] for s in said] == [2 * 6 * 4 - 2, 4 * sum(lengths[1])]
+    # All but the blank ones; four of each row. On a busy computer sets of the real images may lack some, too.
+    assert blank[0] == 2
+    assert [s["images_compared"] for s in said] == [2 * 6 * 4 - 2, 4 * sum(lengths[1]) - blank[1]]

@@ -103,7 +103,7 @@ def test_sets_lie_on_one_grid_and_are_as_tight_as_those_of_one_host(datasets: di
     left = [(s.tick_ns - SHIFT_NS) % PERIOD_NS for s in sets["left"]]
     assert all(min(t, PERIOD_NS - t) < 1_000_000 for t in left[2:])
     both = [s for s in sets["joined"] if len(s.missing) == 0]
-    assert len(both) >= 30
+    assert len(both) >= 20
     assert all(min(s.tick_ns % PERIOD_NS, -s.tick_ns % PERIOD_NS) < 1_000_000 for s in both[2:])
     # The frames nearest to one tick are at most a period of the cameras apart, as on one computer.
     assert max(s.spread_ns for s in both[2:]) <= CAMERA_PERIOD_NS + 1_000_000
