@@ -71,7 +71,7 @@ impl Camera {
     pub fn new(config: CameraConfig) -> Self {
         let state = State {
             phase: CameraState::Opening,
-            since: HostTime::from_ns(0),
+            since: HostTime::now(),
             message: None,
             error: None,
             pose: config.pose,

@@ -142,12 +142,17 @@ class Skew:
 def test_a_latency_is_found_applied_and_gone(binary: str, runtime: Path, tmp_path: Path) -> None:
     board = tmp_path / "board.toml"
     command(binary, runtime, "calibrate", "board", "--name", str(tmp_path / "board"))
-    before = record(binary, runtime, tmp_path, "", "before")
     calibration = tmp_path / "calibration.toml"
-    calibration.write_text(calibration_of(before, board))
     timed = tmp_path / "timed.toml"
-    arguments = ("calibrate", "time", str(before), "--calibration", str(calibration), "--board", str(board), "-o", str(timed))
-    found = json.loads(command(binary, runtime, *arguments, "--json"))
+    for tries in (2, 1, 0):
+        before = record(binary, runtime, tmp_path, "", f"before{tries}")
+        calibration.write_text(calibration_of(before, board))
+        arguments = ("calibrate", "time", str(before), "--calibration", str(calibration), "--board", str(board), "-o", str(timed))
+        # On a busy computer clocks may be known too late for 21 s.
+        said = command(binary, runtime, *arguments, "--json", codes=(0, 1) if tries else (0,))
+        if said:
+            break
+    found = json.loads(said)
     assert found["reference"] == "a" and found["refused"] == []
     a, b = found["cameras"]
     assert (a["camera"], b["camera"], b["measured"], b["subtracted_ms"]) == ("a", "b", False, 0.0)

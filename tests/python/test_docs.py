@@ -189,6 +189,7 @@ def test_the_tutorial_leads_to_a_dataset(binary: str, bench: Path, runtime: Path
     with running(binary, runtime, bench / "log", *shlex.split(take("depthrig run"))[1:2], str(bench / "first.toml")):
         where = address(binary, runtime, "first")
         until(lambda: json.loads(sh("depthrig status --json", CODES))["preparing"] is None)
+        until(lambda: "front/depth  streaming" in sh("depthrig status", CODES))
         assert "front/depth  streaming" in sh(take("depthrig status"), CODES)
         assert "ms old" in python(live)
         with sync_playwright() as playwright:

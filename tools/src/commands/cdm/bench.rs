@@ -12,12 +12,13 @@ use crate::exit::{Exit, UsageError};
 use crate::out;
 use anyhow::{Context as _, Result};
 use depthrig_bus::clock::{HostTime, process_cpu_ns};
+use depthrig_cdm::tiny::{TinyFile, is_tiny_file};
 use depthrig_cdm::{
     Color, ColorFormat, EngineKind, Job, Output, Precision, RawDepth, RefinerOptions, StepTimes,
     find_library, refiner,
 };
 use serde::{Deserialize, Serialize};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 mod flicker;
@@ -46,7 +47,7 @@ Examples:
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct BenchArgs {
-    /// Installed model, or checkpoint file; without one, only fill and tiny can run
+    /// Installed model, or checkpoint file; without one, only fill and tiny can run. Or a tiny.onnx of one's own
     #[arg(long, value_name = "NAME|FILE")]
     model: Option<String>,
     /// Engines, as ENGINE[/DEVICE[/PRECISION]] [default: fill, tiny, onnxruntime]
@@ -81,6 +82,19 @@ pub struct BenchArgs {
     /// Measure one engine in this process
     #[arg(long, hide = true)]
     here: bool,
+}
+
+impl BenchArgs {
+    /// The model that an engine takes, if it is named: `tiny` an ONNX file, the others what is none.
+    fn model_of(&self, spec: &Spec) -> Option<&str> {
+        let is_tiny = |name: &&str| is_tiny_file(Path::new(name));
+        let named = self.model.as_deref();
+        match spec.engine {
+            EngineKind::Tiny => named.filter(is_tiny),
+            engine if engine.needs_model() => named.filter(|name| !is_tiny(name)),
+            _ => None,
+        }
+    }
 }
 
 /// An engine with its device and precision.
@@ -173,9 +187,10 @@ pub fn run(args: &BenchArgs) -> Result<Exit> {
             Ok(_) => specs.push(Spec::of(EngineKind::Tiny)),
             Err(e) => out::note(format_args!("tiny is left out: {e}")),
         }
-        specs.extend(args.model.is_some().then(|| Spec::of(EngineKind::OnnxRuntime)));
+        let network = Spec::of(EngineKind::OnnxRuntime);
+        specs.extend(args.model_of(&network).is_some().then_some(network));
     }
-    if let Some(spec) = specs.iter().find(|s| s.engine.needs_model() && args.model.is_none()) {
+    if let Some(spec) = specs.iter().find(|s| s.engine.needs_model() && args.model_of(s).is_none()) {
         let text = format!("the engine {} needs a model: name one with --model", spec.engine);
         return Err(UsageError(text).into());
     }
@@ -210,7 +225,7 @@ fn measure_in_child(args: &BenchArgs, spec: &Spec, input_size: Option<u32>) -> R
             command.arg(name).arg(value);
         }
     };
-    option("--model", args.model.as_ref().filter(|_| spec.engine.needs_model()).map(AsRef::as_ref));
+    option("--model", args.model_of(spec).map(AsRef::as_ref));
     option("--library", args.library.as_ref().map(AsRef::as_ref));
     option("--models", args.models.dir.as_ref().map(AsRef::as_ref));
     option("--flicker", args.flicker.map(|n| n.to_string()).as_ref().map(AsRef::as_ref));
@@ -233,14 +248,19 @@ fn measure_in_child(args: &BenchArgs, spec: &Spec, input_size: Option<u32>) -> R
 }
 
 fn measure(args: &BenchArgs, spec: &Spec) -> Result<Measured> {
-    let model = match &args.model {
-        Some(name) if spec.engine.needs_model() => Some(args.models.store()?.model(name).map_err(usage)?),
-        _ => None,
-    };
+    let (mut model, mut tiny) = (None, None);
+    match args.model_of(spec) {
+        Some(file) if spec.engine == EngineKind::Tiny => {
+            tiny = Some(TinyFile::read(Path::new(file)).map_err(usage)?);
+        }
+        Some(name) => model = Some(args.models.store()?.model(name).map_err(usage)?),
+        None => {}
+    }
     let input_size = args.input_sizes.first().copied().or(model.as_ref().map(|m| m.input_size)).unwrap_or(0);
     let options = RefinerOptions {
         engine: Some(spec.engine),
         model,
+        tiny,
         input_size: args.input_sizes.first().copied(),
         precision: spec.precision,
         device: spec.device.clone(),
