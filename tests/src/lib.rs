@@ -154,7 +154,7 @@ pub fn uncalibrated_camera(dir: &Path, color: ImageSize, depth: ImageSize) -> Pa
 
 /// Waits until `done` holds; panics with the last status after 20 s.
 pub fn wait_until(rig: &Rig, what: &str, mut done: impl FnMut(&RigStatus) -> bool) -> RigStatus {
-    let deadline = HostTime::now().plus(Duration::from_secs(60));
+    let deadline = HostTime::now().plus(Duration::from_mins(1));
     loop {
         let status = rig.control().status();
         for camera in &status.cameras {

@@ -85,7 +85,7 @@ pub struct BenchArgs {
 }
 
 impl BenchArgs {
-    /// The model that an engine takes, if it is named: `tiny` an ONNX file, the others what is none.
+    /// The model that an engine takes, if it is named: an ONNX file is for `tiny`, any other for the rest.
     fn model_of(&self, spec: &Spec) -> Option<&str> {
         let is_tiny = |name: &&str| is_tiny_file(Path::new(name));
         let named = self.model.as_deref();
