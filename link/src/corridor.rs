@@ -227,16 +227,14 @@ impl Corridor {
         self.recent.drain(..from);
         let first =
             before.zip(slewed).map(|(before, slewed)| Bend { before, at: e.t4, slewed, left: RECENT });
-        match self.bend.take().or(first) {
-            Some(bend) if self.went_on(&bend) => {
-                self.bend = Some(Bend { left: RECENT, ..bend });
-                Taken::Bent
-            }
-            _ => {
-                self.epoch = self.epoch.saturating_add(1);
-                Taken::Stepped
-            }
+        let earlier = self.bend.take();
+        if first.as_ref().is_some_and(|b| self.went_on(b)) && earlier.as_ref().is_none_or(|b| self.went_on(b))
+        {
+            self.bend = earlier.or(first).map(|bend| Bend { left: RECENT, ..bend });
+            return Taken::Bent;
         }
+        self.epoch = self.epoch.saturating_add(1);
+        Taken::Stepped
     }
 
     /// After an exchange that fits: whether it shows that the last bend was a step.

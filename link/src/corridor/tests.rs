@@ -206,6 +206,21 @@ fn a_step_behind_a_long_exchange_begins_an_epoch_and_a_slewed_clock_does_not() {
 }
 
 #[test]
+fn a_step_soon_after_a_bend_begins_an_epoch() {
+    let clocks = Clocks { offset: 0, rate: 0.0 };
+    let mut corridor = Corridor::default();
+    let end = run(&mut corridor, &clocks, 0, false, &mut Vec::new());
+    let offset_at = |local: i64| ((local - end) as f64 * 500e-6).round() as i64;
+    let slewed = |local: i64, stepped: i64| {
+        let at = Clocks { offset: offset_at(local) + stepped, rate: 0.0 };
+        at.exchange(local, 20_000, 15_000, 20_000)
+    };
+    let bent: Vec<_> = (0..40).map(|k| corridor.take(slewed(end + k * 50 * MS, 0))).collect();
+    assert!(bent.contains(&Taken::Bent) && !bent.contains(&Taken::Stepped), "{bent:?}");
+    assert_eq!(corridor.take(slewed(end + 2_000 * MS, 2 * MS)), Taken::Stepped);
+}
+
+#[test]
 fn a_step_while_nothing_came_begins_an_epoch() {
     for (there, back) in [(20_000, 20_000), (150 * MS, MS)] {
         let clocks = Clocks { offset: 0, rate: 0.0 };
