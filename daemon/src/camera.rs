@@ -157,3 +157,18 @@ pub struct Shared {
     /// Where depth is refined.
     pub stage: Arc<Intake>,
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::RigConfig;
+
+    #[test]
+    fn a_camera_that_was_never_opened_is_in_its_state_since_it_was_made() {
+        let text = "rig = \"test\"\n[[camera]]\nname = \"front\"\nbackend = \"synthetic\"\n";
+        let rig = RigConfig::parse(text, None).unwrap();
+        let began = HostTime::now();
+        let camera = Camera::new(rig.cameras[0].clone());
+        assert!(camera.state().since >= began);
+    }
+}
