@@ -80,7 +80,7 @@ def both(rig: Rig, stream: str, count: int) -> list[tuple[Any, np.ndarray, Any, 
         originals: dict[int, tuple[Any, np.ndarray]] = {}
         deadline = time.monotonic() + WAIT_S
         while len(out) < count:
-            assert time.monotonic() < deadline, f"{len(out)} frames of {stream} came"
+            assert time.monotonic() < deadline, f"{len(out)} frames of {stream} came; {mirrors(rig)[stream]}"
             with there.next(timeout=WAIT_S) as frame:
                 originals[frame.header.device_sequence] = (frame.header, np.array(frame.array))
             try:
