@@ -237,7 +237,7 @@ impl Corridor {
         Taken::Stepped
     }
 
-    /// After an exchange that fits: whether it shows that the last bend was a step.
+    /// Takes back the last bend if an exchange that fits shows that it was a step.
     fn settle(&mut self) -> Taken {
         let Some(bend) = self.bend.take() else { return Taken::Fits };
         if self.went_on(&bend) {
@@ -253,7 +253,7 @@ impl Corridor {
         Taken::Stepped
     }
 
-    /// Whether the offset may be where the lines before a bend led, by a clock that was slewed.
+    /// True if a slewed clock may have led from the lines before a bend to the present offset.
     fn went_on(&self, bend: &Bend) -> bool {
         let here = HostTime::from_ns(self.newest);
         self.at(here).is_some_and(|now| {
