@@ -10,7 +10,8 @@ import signal
 import struct
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -526,8 +527,17 @@ def test_the_end_of_the_rig_closes_its_pages(binary: str, runtime: Path, tmp_pat
     with running(binary, runtime, tmp_path / "log", "run", str(tmp_path / "rig.toml"), "-q") as daemon:
         wait_for(binary, runtime, "ending")
         url, token = json.loads(command(binary, runtime, "open", "--json", "--rig", "ending"))["url"].split("#token=")
-        with Rig(url, token, daemon.pid).page(WALL) as page:
+        with Rig(url, token, daemon.pid).page(WALL) as page, ThreadPoolExecutor(1) as beside:
             page.image()
+            # What a page says while the daemon closes must not reset the connection before the reason has come.
+            beside.submit(say_until_closed, page)
             daemon.send_signal(signal.SIGINT)
             assert closed(page.socket) == (1001, "the rig ends")
             daemon.wait(WAIT_S)
+
+
+def say_until_closed(page: Page) -> None:
+    with suppress(ConnectionClosed):
+        while True:
+            page.say(credit=1)
+            time.sleep(0.0002)

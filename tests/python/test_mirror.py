@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import json
 import re
+import threading
 import time
 import tomllib
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -70,28 +72,53 @@ def read(rig: Rig) -> Iterator[None]:
         yield
 
 
+Frames = dict[int, tuple[Any, np.ndarray]]
+"""The last frames of a stream, by the camera's own numbers."""
+KEPT = 60
+
+
+def keep(frames: Frames, source: depthrig.Stream) -> None:
+    with source.next(timeout=WAIT_S) as frame:
+        frames[frame.header.device_sequence] = (frame.header, np.array(frame.array))
+    if len(frames) > KEPT:
+        del frames[min(frames)]
+
+
+@contextmanager
+def kept(source: depthrig.Stream) -> Iterator[Frames]:
+    """Its last frames, read beside: all of them, however few are mirrored."""
+    frames: Frames = {}
+    is_over = threading.Event()
+
+    def read() -> None:
+        while not is_over.is_set():
+            keep(frames, source)
+
+    with ThreadPoolExecutor(1) as beside:
+        reading = beside.submit(read)
+        try:
+            yield frames
+        finally:
+            is_over.set()
+            reading.result()
+
+
 def both(rig: Rig, stream: str, count: int) -> list[tuple[Any, np.ndarray, Any, np.ndarray]]:
     """Frames that were read on both computers."""
     out: list[tuple[Any, np.ndarray, Any, np.ndarray]] = []
     with (
         depthrig.Stream(stream, "mount", rig.runtime["here"], timeout=WAIT_S) as here,
         depthrig.Stream(stream, "mount", rig.runtime["there"], timeout=WAIT_S) as there,
+        kept(there) as originals,
     ):
-        originals: dict[int, tuple[Any, np.ndarray]] = {}
+        mirrored: Frames = {}
         deadline = time.monotonic() + WAIT_S
         while len(out) < count:
             assert time.monotonic() < deadline, f"{len(out)} frames of {stream} came; {mirrors(rig)[stream]}"
-            with there.next(timeout=WAIT_S) as frame:
-                originals[frame.header.device_sequence] = (frame.header, np.array(frame.array))
-            try:
-                frame = here.next(timeout=0.1)
-            except depthrig.Timeout:
-                continue
-            with frame:
-                original = originals.get(frame.header.device_sequence)
-                if original is not None:
-                    out.append((frame.header, np.array(frame.array), *original))
-                    deadline = time.monotonic() + WAIT_S
+            keep(mirrored, here)
+            for number in list(mirrored):
+                if (original := originals.get(number)) is not None:
+                    out.append((*mirrored.pop(number), *original))
     return out
 
 
@@ -111,9 +138,9 @@ def test_frames_are_here_as_they_are_there(rig: Rig) -> None:
     wait_for("the clock", lambda: rig.host()["has_clock"])
     for stream in STREAMS:
         with read(rig):
-            # A computer that is busy carries them small for some seconds.
+            # A computer that is busy carries them small for some seconds, and at last for a minute.
             for _ in range(5):
-                wait_for_mirror(rig, stream, "live", coding="raw")
+                wait_for_mirror(rig, stream, "live", 3 * WAIT_S, coding="raw")
                 frames = both(rig, stream, 30)
                 check_headers(rig, frames)
                 if mirrors(rig)[stream]["coding"] == "raw":

@@ -5,7 +5,7 @@
 //! `file://`, and a page that was not given the address cannot guess it.
 
 use super::guard;
-use super::limits::end_of;
+use super::limits::{close, end_of};
 use super::reply::Refusal;
 use super::token::Token;
 use crate::control::Control;
@@ -16,7 +16,7 @@ use crate::foxglove::{
 use axum::Router;
 use axum::body::Bytes;
 use axum::extract::ws::rejection::WebSocketUpgradeRejection;
-use axum::extract::ws::{CloseFrame, Message, WebSocket, WebSocketUpgrade};
+use axum::extract::ws::{Message, WebSocket, WebSocketUpgrade};
 use axum::extract::{Path, State};
 use axum::http::StatusCode;
 use axum::response::{IntoResponse, Response};
@@ -130,7 +130,7 @@ async fn serve(mut socket: WebSocket, service: Service) {
         None => Some(End { code: code::FULL, reason: "too many viewers are connected; close one" }),
     };
     if let Some(End { code, reason }) = end {
-        let _ = socket.send(Message::Close(Some(CloseFrame { code, reason: reason.into() }))).await;
+        close(&mut socket, code, reason).await;
     }
 }
 

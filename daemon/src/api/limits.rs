@@ -7,6 +7,7 @@ use super::MAX_BODY_BYTES;
 use super::reply::Refusal;
 use axum::body::{Body, to_bytes};
 use axum::extract::Request;
+use axum::extract::ws::{CloseFrame, Message, WebSocket};
 use axum::http::StatusCode;
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
@@ -25,6 +26,21 @@ pub(super) const HEAD_TIMEOUT: Duration = Duration::from_secs(10);
 const BODY_TIMEOUT: Duration = Duration::from_secs(5);
 /// How long a client may take to read an answer.
 pub(super) const WRITE_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// How long a client may take to answer the end of its WebSocket.
+const CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// Ends a WebSocket with a code and a reason, and reads what its client still says until it has heard them: a connection that is closed with bytes
+/// unread is reset, and the reason can be lost with it.
+pub(super) async fn close(socket: &mut WebSocket, code: u16, reason: &str) {
+    let reason = reason.into();
+    let ended = async {
+        if socket.send(Message::Close(Some(CloseFrame { code, reason }))).await.is_ok() {
+            while let Some(Ok(_)) = socket.recv().await {}
+        }
+    };
+    let _ = tokio::time::timeout(CLOSE_TIMEOUT, ended).await;
+}
 
 /// Reads the body within its limits of time and size.
 pub(super) async fn whole_body(request: Request, next: Next) -> Response {

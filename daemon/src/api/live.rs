@@ -1,6 +1,6 @@
 //! The WebSocket of the live page: status, images, signals, and questions about pixels. docs/live-page.md describes its messages.
 
-use super::limits::end_of;
+use super::limits::{close, end_of};
 use super::recordings;
 use super::reply::Refusal;
 use super::requests::{LoopRequest, RateRequest, StepRequest};
@@ -12,7 +12,7 @@ use crate::viewers::{
     SignalFeed, SignalPlace, Viewers, Watch,
 };
 use axum::Extension;
-use axum::extract::ws::{CloseFrame, Message as Frame, WebSocket, WebSocketUpgrade};
+use axum::extract::ws::{Message as Frame, WebSocket, WebSocketUpgrade};
 use axum::extract::{Query, State};
 use axum::http::StatusCode;
 use axum::response::{IntoResponse, Response};
@@ -172,7 +172,7 @@ async fn serve(mut socket: WebSocket, rig: Arc<dyn Control>, live: Live, asked: 
             reason.truncate(reason.floor_char_boundary(MAX_REASON_BYTES - '…'.len_utf8()));
             reason.push('…');
         }
-        let _ = socket.send(Frame::Close(Some(CloseFrame { code, reason: reason.into() }))).await;
+        close(&mut socket, code, &reason).await;
     }
 }
 

@@ -10,6 +10,8 @@ const FULL: f64 = 0.6;
 const SLOW_FRAMES: u32 = 3;
 /// Share of that time which an image would have to travel as it is, by what small ones take, for coming as it is again.
 const ROOM: f64 = 0.3;
+/// A frame that has no room says nothing while another had some so shortly before: what held it up was this computer, or a burst of others.
+const HELD_UP: Duration = Duration::from_secs(1);
 /// There must be room for so long; twice as long after each time that it was not true, at most the second.
 const WAITS: [Duration; 2] = [Duration::from_secs(5), Duration::from_mins(1)];
 
@@ -33,14 +35,14 @@ pub(super) struct Journey {
 pub(super) struct Pace {
     ask: Ask,
     slow: u32,
-    /// Since when there has been room.
-    since: Option<HostTime>,
+    /// Since when there has been room, and when a frame last had it.
+    room: Option<(HostTime, HostTime)>,
     wait: Duration,
 }
 
 impl Default for Pace {
     fn default() -> Self {
-        Self { ask: Ask::Raw, slow: 0, since: None, wait: WAITS[0] }
+        Self { ask: Ask::Raw, slow: 0, room: None, wait: WAITS[0] }
     }
 }
 
@@ -58,15 +60,19 @@ impl Pace {
             Ask::Raw => {
                 self.slow = if share > FULL { self.slow + 1 } else { self.slow.saturating_sub(1) };
                 if self.slow >= SLOW_FRAMES {
-                    *self = Self { ask: Ask::Small, slow: 0, since: None, wait: self.wait };
+                    *self = Self { ask: Ask::Small, slow: 0, room: None, wait: self.wait };
                 }
             }
-            Ask::Small if share > ROOM => self.since = None,
             Ask::Small => {
-                let since = *self.since.get_or_insert(journey.at);
-                if since.plus(self.wait) <= journey.at {
+                let held = self.room.filter(|(_, last)| journey.at <= last.plus(HELD_UP));
+                self.room = if share > ROOM {
+                    held
+                } else {
+                    Some((held.map_or(journey.at, |(since, _)| since), journey.at))
+                };
+                if self.room.is_some_and(|(since, _)| since.plus(self.wait) <= journey.at) {
                     let wait = (self.wait * 2).min(WAITS[1]);
-                    *self = Self { ask: Ask::Raw, slow: 0, since: None, wait };
+                    *self = Self { ask: Ask::Raw, slow: 0, room: None, wait };
                 }
             }
         }
@@ -113,6 +119,27 @@ mod tests {
         let asks = travel(&mut pace, 10.0, 10.0, 1.2e9);
         let back = asks.iter().position(|a| *a == Ask::Raw).unwrap();
         assert!((145..160).contains(&back), "{back}");
+    }
+
+    #[test]
+    fn frames_that_a_busy_computer_holds_up_do_not_keep_them_small() {
+        let mut pace = Pace::default();
+        travel(&mut pace, 0.0, 1.0, 12e6);
+        assert_eq!(pace.ask(), Ask::Small);
+        // Of each second only one frame passes at the way's own speed.
+        let seconds = (1..8).take_while(|s| {
+            travel(&mut pace, f64::from(*s), 0.9, 12e6);
+            travel(&mut pace, f64::from(*s) + 0.9, 0.1, 1.2e9);
+            pace.ask() == Ask::Small
+        });
+        assert_eq!(seconds.count(), 5);
+        // One that passes in two seconds is no room.
+        travel(&mut pace, 9.0, 1.0, 12e6);
+        for s in (10..40).step_by(2) {
+            travel(&mut pace, f64::from(s), 1.9, 12e6);
+            travel(&mut pace, f64::from(s) + 1.9, 0.1, 1.2e9);
+            assert_eq!(pace.ask(), Ask::Small);
+        }
     }
 
     #[test]
