@@ -58,6 +58,10 @@ def stamp_ns(message: Any) -> int:
     return int(message.header.stamp.sec) * 1_000_000_000 + int(message.header.stamp.nanosec)
 
 
+def by_stamp(messages: list[Any]) -> dict[int, Any]:
+    return {stamp_ns(message): message for message in messages}
+
+
 @dataclass
 class Heard:
     """What came on a topic."""
@@ -223,14 +227,19 @@ class Bus:
             depth = frame.depth_m() if frame.header.is_depth else None
             self.frames[frame.capture_time_ns] = Seen(frame.header, frame.copy(), depth)
 
-    def at(self, utc_ns: int) -> Seen:
-        """The frame of a stamp, once it was read."""
-        time_ns = utc_ns - utc_offset_ns()
-        until(
-            lambda: any(abs(t - time_ns) < STAMP_NS for t in list(self.frames)),
-            f"the frame of {time_ns} among {sorted(self.frames)}",
-        )
-        return self.frames[min(list(self.frames), key=lambda t: abs(t - time_ns))]
+    def frames_of(self, stamps_ns: list[int]) -> dict[int, Seen]:
+        """The frames of stamps in UTC, once they were read, and by the stamp: all but those for which this reader itself came too late."""
+        offset_ns = utc_offset_ns()
+        found = {}
+        for stamp_ns in stamps_ns:
+            time_ns = stamp_ns - offset_ns
+            until(lambda: any(t > time_ns - STAMP_NS for t in list(self.frames)), f"a frame of {time_ns} or later")  # noqa: B023
+            nearest = min(list(self.frames), key=lambda t: abs(t - time_ns))  # noqa: B023
+            if abs(nearest - time_ns) < STAMP_NS:
+                found[stamp_ns] = self.frames[nearest]
+        absent = len(set(stamps_ns) - found.keys())
+        assert found and absent <= self._stream.missed, (absent, self._stream.missed, stamps_ns, sorted(self.frames))
+        return found
 
     def __enter__(self) -> Bus:
         return self

@@ -1,6 +1,6 @@
 """A node of zenoh-ros2-sdk, which knows nothing of depthrig: PORT, then TOPIC TYPE pairs.
 
-It prints the third message of each topic as JSON. Definitions come as JSON on standard input: type, then text and hash.
+It prints the third to the seventh message of each topic as JSON. Definitions come as JSON on standard input: type, then text and hash.
 """
 
 import hashlib
@@ -11,7 +11,7 @@ import threading
 
 from zenoh_ros2_sdk import ROS2Subscriber
 
-NUMBER = 3
+FIRST, LAST = 3, 7
 port, *rest = sys.argv[1:]
 definitions = json.load(sys.stdin)
 pairs = list(zip(rest[::2], rest[1::2], strict=True))
@@ -23,7 +23,7 @@ whole_lines = threading.Lock()
 def printed(topic):
     def came(message):
         counts[topic] += 1
-        if counts[topic] != NUMBER:
+        if not FIRST <= counts[topic] <= LAST:
             return
         data = getattr(message, "data", b"")
         raw = data.encode() if isinstance(data, str) else bytes(data)
@@ -40,7 +40,8 @@ def printed(topic):
             about["accel"] = message.linear_acceleration.z
         with whole_lines:
             print(json.dumps(about), flush=True)
-        done[topic].set()
+        if counts[topic] == LAST:
+            done[topic].set()
 
     return came
 

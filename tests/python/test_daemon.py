@@ -13,7 +13,7 @@ import signal
 import subprocess
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -125,6 +125,15 @@ def command(binary: str, runtime: Path, *arguments: str, codes: tuple[int, ...] 
     )
     assert done.returncode in codes, f"{arguments} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}"
     return done.stdout
+
+
+def thread_named(process_id: int, name: str) -> Path | None:
+    """The folder in /proc of the process's thread of that name."""
+    for thread in Path(f"/proc/{process_id}/task").iterdir():
+        with suppress(FileNotFoundError, ProcessLookupError):  # it has just ended
+            if (thread / "comm").read_text().strip() == name:
+                return thread
+    return None
 
 
 def open_stream(runtime: Path, camera: Camera, stream: str) -> depthrig.Stream:

@@ -21,7 +21,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from page import CHROMIUM, PATCHES, SIMULATED, files_camera, free_port, pattern
 from playwright.sync_api import sync_playwright
-from test_daemon import ROOT, WAIT_S, binary, command, running, runtime
+from test_daemon import ROOT, WAIT_S, binary, command, running, runtime, thread_named
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
@@ -95,8 +95,7 @@ class Rig:
 
     def has_thread(self) -> bool:
         """Whether the daemon has the thread that encodes."""
-        names = Path(f"/proc/{self.process_id}/task").glob("*/comm")
-        return any(name.read_text().strip() == "foxglove" for name in names)
+        return thread_named(self.process_id, "foxglove") is not None
 
     def wait_for_no_thread(self) -> None:
         until = time.monotonic() + WAIT_S

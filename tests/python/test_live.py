@@ -20,7 +20,7 @@ import depthrig
 import numpy as np
 import pytest
 from PIL import Image
-from test_daemon import WAIT_S, binary, command, running, runtime
+from test_daemon import WAIT_S, binary, command, running, runtime, thread_named
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
@@ -137,8 +137,7 @@ class Rig:
 
     def thread(self) -> Path | None:
         """The daemon's thread that encodes."""
-        names = Path(f"/proc/{self.process_id}/task").glob("*/comm")
-        return next((name.parent for name in names if name.read_text().strip() == "viewers"), None)
+        return thread_named(self.process_id, "viewers")
 
     def encoding_ns(self) -> int:
         """The CPU time of that thread."""

@@ -34,7 +34,7 @@ from depthrig._header import Intrinsics
 from depthrig.ros2 import _cloud, _images, _names, _session, _types
 from depthrig.ros2._inbound_signal import signal_name
 from depthrig.ros2._types import CAMERA_INFO, COMPRESSED, DIAGNOSTICS, IMAGE, IMU, JOINTS, POINTS, POSE, TRANSFORMS
-from ros2 import STAMP_NS, Bridge, Bus, Heard, Router, bridge, decode, definition, free_port, stamp_ns, until, utc_offset_ns
+from ros2 import STAMP_NS, Bridge, Bus, Heard, Router, bridge, by_stamp, decode, definition, free_port, stamp_ns, until, utc_offset_ns
 
 __all__ = ["binary", "runtime"]
 
@@ -159,26 +159,28 @@ def test_images_are_those_of_the_bus(node: Bridge, router: Router, runtime: Path
             messages = raw.wait(20)
             # One may be under way. On a busy computer a message may be lost on its way to the subscriber, as these are sent at best effort.
             until(lambda: stamp_ns(info.messages()[-1]) >= stamp_ns(messages[-2]), "as many of the other topic")
-            infos = {stamp_ns(m): m for m in info.messages()}
+            infos = by_stamp(info.messages())
             lost = int((np.diff(numbers(info)) - 1).sum())
             assert sum(stamp_ns(m) not in infos for m in messages[1:-1]) <= lost, "same stamps"
-            for message in messages[1:]:
-                seen = bus.at(stamp_ns(message))
+            frames = bus.frames_of([stamp_ns(message) for message in messages[1:]])
+            compared = [(i, message, frames[stamp_ns(message)]) for i, message in enumerate(messages) if stamp_ns(message) in frames]
+            for _, message, seen in compared:
                 assert (message.encoding, message.is_bigendian) == (encoding, 0)
                 assert (message.height, message.width) == seen.array.shape[:2]
                 assert message.step == seen.array.nbytes // message.height
                 assert message.header.frame_id == f"top_{name}_optical_frame"
                 assert bytes(message.data) == seen.array.tobytes()
-            one = next(iter(infos.values()))
-            k = bus.at(stamp_ns(one)).header.intrinsics
+            stamp = next(stamp for stamp in frames if stamp in infos)
+            one, k = infos[stamp], frames[stamp].header.intrinsics
             assert one.distortion_model == "plumb_bob"
             assert list(one.k) == [k.fx, 0, k.cx, 0, k.fy, k.cy, 0, 0, 1]
             assert list(one.p) == [k.fx, 0, k.cx, 0, 0, k.fy, k.cy, 0, 0, 0, 1, 0]
             assert (list(one.d), list(one.r)) == (list(k.coeffs[:5]), [1, 0, 0, 0, 1, 0, 0, 0, 1])
             # Numbers of what was sent, the time of sending, and one identity. The number of an image that was lost is missed, and so is its frame.
             sent_as = [int.from_bytes(a[:8], "little") for a in raw.attachments[: len(messages)]]
-            frames = [bus.at(stamp_ns(message)).header.sequence for message in messages[1:]]
-            assert all(1 <= sent <= taken for sent, taken in zip(np.diff(sent_as[1:]), np.diff(frames), strict=True)), (sent_as, frames)
+            sent = np.diff([sent_as[i] for i, *_ in compared])
+            taken = np.diff([seen.header.sequence for *_, seen in compared])
+            assert all((1 <= sent) & (sent <= taken)), (sent, taken)
             token = next(t for t in router.tokens if f"%{name}%image_raw/" in t and "/depthrig_cell/" in t)
             assert {a[16:] for a in raw.attachments} == {b"\x10" + _names.identity(token)}
             sent_ns = int.from_bytes(raw.attachments[-1][8:16], "little")
@@ -192,16 +194,20 @@ def test_compressed_images_are_those_of_the_bus(node: Bridge, router: Router, ru
         router.hear(f"{TOP}/color/image_raw/compressed", COMPRESSED) as jpeg,
         router.hear(f"{TOP}/depth/image_raw/compressedDepth", COMPRESSED) as png,
     ):
-        for message in jpeg.wait(4)[1:]:
+        of_colour = by_stamp(jpeg.wait(4)[1:])
+        for stamp, seen in color.frames_of(list(of_colour)).items():
+            message = of_colour[stamp]
             assert message.format == "rgb8; jpeg compressed bgr8"
             pixels = np.asarray(Image.open(io.BytesIO(message.data)))
-            off = np.abs(pixels.astype(int) - color.at(stamp_ns(message)).array)
+            off = np.abs(pixels.astype(int) - seen.array)
             assert off.mean() < 2
-        for message in png.wait(4)[1:]:
+        of_depth = by_stamp(png.wait(4)[1:])
+        for stamp, seen in depth.frames_of(list(of_depth)).items():
+            message = of_depth[stamp]
             assert message.format == "16UC1; compressedDepth png"
             assert bytes(message.data[:12]) == bytes(12)
             pixels = np.asarray(Image.open(io.BytesIO(message.data[12:])))
-            np.testing.assert_array_equal(pixels, depth.at(stamp_ns(message)).array)
+            np.testing.assert_array_equal(pixels, seen.array)
 
 
 def test_points_are_the_geometry_of_depth_and_camera_info(node: Bridge, router: Router) -> None:
@@ -342,7 +348,7 @@ def test_after_a_pause_the_newest_image_comes_and_the_others_are_counted(node: B
         node.process.send_signal(signal.SIGCONT)
         messages = heard.wait(len(heard.payloads) + 8)
         lost = int((np.diff(numbers(heard)[: len(messages)]) - 1).sum())
-        frames = [bus.at(stamp_ns(message)).header.sequence for message in messages]
+        frames = [seen.header.sequence for seen in bus.frames_of([stamp_ns(m) for m in messages]).values()]
     steps = np.diff(frames)
     after = int(steps.argmax()) + 1
     assert steps.max() > 10 and frames[after] >= newest, (frames, newest)
@@ -618,13 +624,16 @@ def test_an_independent_implementation_receives_every_type(node: Bridge, router:
 
         until(both, "it receives")
         assert sdk.returncode == 0
-        heard = {m["topic"]: m for m in map(json.loads, sdk.stdout)}
-        seen = bus.at(heard[f"{TOP}/color/image_raw"]["stamp"])
+        messages = list(map(json.loads, sdk.stdout))
+        heard = {m["topic"]: m for m in messages}
+        images = {m["stamp"]: m for m in messages if m["topic"] == f"{TOP}/color/image_raw"}
+        frames = bus.frames_of(list(images))
     chatter.undeclare()
     assert heard.keys() == topics.keys()
-    image = heard[f"{TOP}/color/image_raw"]
-    assert (image["encoding"], image["width"], image["height"]) == ("rgb8", 640, 480)
-    assert image["sha"] == hashlib.sha256(seen.array.tobytes()).hexdigest()
+    for stamp, seen in frames.items():
+        image = images[stamp]
+        assert (image["encoding"], image["width"], image["height"]) == ("rgb8", 640, 480)
+        assert image["sha"] == hashlib.sha256(seen.array.tobytes()).hexdigest()
     assert heard[f"{TOP}/color/camera_info"]["distortion_model"] == "plumb_bob"
     assert heard[f"{TOP}/depth/points"]["size"] == 640 * 480 * 12
     assert abs(heard[f"{TOP}/imu/data_raw"]["accel"]) < 50
