@@ -64,11 +64,10 @@ impl Pace {
                 }
             }
             Ask::Small => {
-                let held = self.room.filter(|(_, last)| journey.at <= last.plus(HELD_UP));
                 self.room = if share > ROOM {
-                    held
+                    self.room.filter(|(_, last)| journey.at <= last.plus(HELD_UP))
                 } else {
-                    Some((held.map_or(journey.at, |(since, _)| since), journey.at))
+                    Some((self.room.map_or(journey.at, |(since, _)| since), journey.at))
                 };
                 if self.room.is_some_and(|(since, _)| since.plus(self.wait) <= journey.at) {
                     let wait = (self.wait * 2).min(WAITS[1]);
@@ -83,22 +82,26 @@ impl Pace {
 mod tests {
     use super::*;
 
+    const RAW_BYTES: usize = 1_843_200;
+
+    /// The next frame of a stream of such a period over a way of so many bytes a second.
+    fn journey(pace: &Pace, at_s: f64, period_s: f64, rate: f64) -> Journey {
+        let bytes = if pace.ask() == Ask::Raw { RAW_BYTES } else { RAW_BYTES / 5 };
+        Journey {
+            at: HostTime::from_ns((at_s * 1e9) as i64),
+            bytes,
+            raw_bytes: RAW_BYTES,
+            took: Duration::from_secs_f64(bytes as f64 / rate),
+            period: Duration::from_secs_f64(period_s),
+        }
+    }
+
     /// Frames at 30 Hz over a way of so many bytes a second, for so many seconds; how they came.
     fn travel(pace: &mut Pace, from_s: f64, seconds: f64, rate: f64) -> Vec<Ask> {
-        let raw_bytes = 1_843_200;
         let frames = (seconds * 30.0) as usize;
         (0..frames)
             .map(|i| {
-                let bytes = if pace.ask() == Ask::Raw { raw_bytes } else { raw_bytes / 5 };
-                let at = HostTime::from_ns(((from_s + i as f64 / 30.0) * 1e9) as i64);
-                let took = Duration::from_secs_f64(bytes as f64 / rate);
-                pace.learn(&Journey {
-                    at,
-                    bytes,
-                    raw_bytes,
-                    took,
-                    period: Duration::from_secs_f64(1.0 / 30.0),
-                });
+                pace.learn(&journey(pace, from_s + i as f64 / 30.0, 1.0 / 30.0, rate));
                 pace.ask()
             })
             .collect()
@@ -126,20 +129,34 @@ mod tests {
         let mut pace = Pace::default();
         travel(&mut pace, 0.0, 1.0, 12e6);
         assert_eq!(pace.ask(), Ask::Small);
-        // Of each second only one frame passes at the way's own speed.
+        // Of each second a tenth passes at the way's own speed.
         let seconds = (1..8).take_while(|s| {
             travel(&mut pace, f64::from(*s), 0.9, 12e6);
             travel(&mut pace, f64::from(*s) + 0.9, 0.1, 1.2e9);
             pace.ask() == Ask::Small
         });
         assert_eq!(seconds.count(), 5);
-        // One that passes in two seconds is no room.
+        // A tenth in each two seconds is less than there must be.
         travel(&mut pace, 9.0, 1.0, 12e6);
         for s in (10..40).step_by(2) {
             travel(&mut pace, f64::from(s), 1.9, 12e6);
             travel(&mut pace, f64::from(s) + 1.9, 0.1, 1.2e9);
             assert_eq!(pace.ask(), Ask::Small);
         }
+    }
+
+    #[test]
+    fn a_stream_whose_frames_are_seconds_apart_comes_as_it_is_again() {
+        let mut pace = Pace::default();
+        for i in 0..3 {
+            pace.learn(&journey(&pace, f64::from(i) * 2.0, 2.0, 0.5e6));
+        }
+        assert_eq!(pace.ask(), Ask::Small);
+        let asks = [6.0, 8.0, 10.0, 12.0].map(|at_s| {
+            pace.learn(&journey(&pace, at_s, 2.0, 12e6));
+            pace.ask()
+        });
+        assert_eq!(asks, [Ask::Small, Ask::Small, Ask::Small, Ask::Raw]);
     }
 
     #[test]
