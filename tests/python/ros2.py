@@ -227,6 +227,11 @@ class Bus:
             depth = frame.depth_m() if frame.header.is_depth else None
             self.frames[frame.capture_time_ns] = Seen(frame.header, frame.copy(), depth)
 
+    @property
+    def missed(self) -> int:
+        """Frames for which this reader came too late."""
+        return self._stream.missed
+
     def frames_of(self, stamps_ns: list[int]) -> dict[int, Seen]:
         """The frames of stamps in UTC, once they were read, and by the stamp: all but those for which this reader itself came too late."""
         offset_ns = utc_offset_ns()
@@ -238,7 +243,7 @@ class Bus:
             if abs(nearest - time_ns) < STAMP_NS:
                 found[stamp_ns] = self.frames[nearest]
         absent = len(set(stamps_ns) - found.keys())
-        assert found and absent <= self._stream.missed, (absent, self._stream.missed, stamps_ns, sorted(self.frames))
+        assert found and absent <= self.missed, (absent, self.missed, stamps_ns, sorted(self.frames))
         return found
 
     def __enter__(self) -> Bus:

@@ -311,16 +311,25 @@ def test_a_late_subscriber_gets_the_poses(node: Bridge, router: Router, runtime:
 
 
 def test_every_sample_of_an_imu_is_sent(node: Bridge, router: Router, runtime: Path) -> None:
-    with Bus(runtime, "top/imu", "cell") as bus, router.hear(f"{TOP}/imu/data_raw", IMU) as heard:
+    topic = f"{TOP}/imu/data_raw"
+    late_before = node.status()["topics"][topic]["missed"]
+    with Bus(runtime, "top/imu", "cell") as bus, router.hear(topic, IMU) as heard:
         messages = heard.wait(300)
-        samples = np.concatenate([seen.array for _, seen in sorted(bus.frames.items())])
-    stamps = np.array([stamp_ns(m) for m in messages])
-    offset = utc_offset_ns()
-    first = int(np.abs(samples["time_ns"] + offset - stamps[0]).argmin())
-    both = min(len(messages), len(samples) - first)
-    assert both > 200
-    for message, sample in zip(messages[:both], samples[first:], strict=False):
-        assert abs(int(sample["time_ns"]) + offset - stamp_ns(message)) < 2_000_000
+        stamps = np.array([stamp_ns(m) for m in messages])
+        offset = utc_offset_ns()
+        until(lambda: max(bus.frames) + offset > stamps[-1], "the bus's samples of that time")
+        batches = [seen.array for _, seen in sorted(bus.frames.items())]
+    samples = np.concatenate(batches)
+    nearest = np.abs(samples["time_ns"][None] + offset - stamps[:, None]).argmin(axis=1)
+    is_there = np.abs(samples["time_ns"][nearest] + offset - stamps) < 2_000_000
+    # Samples that the test's own reader was late for have nothing to be compared with.
+    assert is_there.sum() > 200 and (~is_there).sum() <= bus.missed * max(map(len, batches)), (is_there.sum(), bus.missed)
+    # On a busy computer messages are lost on their way, and the program's own reader is late; it counts that.
+    lost = int((np.diff(numbers(heard)[: len(messages)]) - 1).sum())
+    late = node.status()["topics"][topic]["missed"] - late_before
+    steps = np.diff(nearest[is_there])
+    assert steps.min() > 0 and (steps - 1).sum() <= lost + late, (steps, lost, late)
+    for message, sample in zip(np.array(messages)[is_there], samples[nearest[is_there]], strict=True):
         gyro, accel = message.angular_velocity, message.linear_acceleration
         assert (gyro.x, gyro.y, gyro.z) == tuple(sample["gyro_rad_s"].astype(float))
         assert (accel.x, accel.y, accel.z) == tuple(sample["accel_m_s2"].astype(float))
@@ -493,7 +502,8 @@ def test_the_signal_of_a_topic_has_a_valid_name(topic: str, name: str) -> None:
 
 def test_joint_states_of_ros_become_a_signal(node: Bridge, router: Router, runtime: Path) -> None:
     key = f"0/joint_states/{_types.about(JOINTS)}"
-    publisher = router.session.declare_publisher(key)
+    # As a reliable publisher of ROS 2: a message waits for its place on the way.
+    publisher = router.session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
     token = router.session.liveliness().declare_token(
         _names.endpoint_token(
             0, "f00d", "robot", 7, "MP", "/joint_states", f"{_types.about(JOINTS)}/{_names.Qos.RELIABLE.value}"
@@ -571,7 +581,8 @@ def test_poses_of_ros_become_a_signal(node: Bridge, router: Router, runtime: Pat
 
     # Of Humble, which has no hash.
     publisher = router.session.declare_publisher(
-        "0/arm/pose/geometry_msgs::msg::dds_::PoseStamped_/TypeHashNotSupported"
+        "0/arm/pose/geometry_msgs::msg::dds_::PoseStamped_/TypeHashNotSupported",
+        congestion_control=zenoh.CongestionControl.BLOCK,
     )
     publisher.put(pose("base", 1.0))
     with depthrig.SignalReader("arm/pose", runtime, timeout=WAIT_S) as reader:
