@@ -242,7 +242,8 @@ class Bus:
             nearest = min(list(self.frames), key=lambda t: abs(t - time_ns))  # noqa: B023
             if abs(nearest - time_ns) < STAMP_NS:
                 found[stamp_ns] = self.frames[nearest]
-        absent = len(set(stamps_ns) - found.keys())
+        begun_ns = min(list(self.frames)) + offset_ns
+        absent = sum(stamp_ns > begun_ns for stamp_ns in set(stamps_ns) - found.keys())
         assert found and absent <= self.missed, (absent, self.missed, stamps_ns, sorted(self.frames))
         return found
 

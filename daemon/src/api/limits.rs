@@ -27,7 +27,7 @@ const BODY_TIMEOUT: Duration = Duration::from_secs(5);
 /// How long a client may take to read an answer.
 pub(super) const WRITE_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// How long a client may take to answer the end of its WebSocket.
+/// Most time that a client may take to answer the end of its WebSocket.
 const CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Ends a WebSocket with a code and a reason, and reads what its client still says until it has heard them: a connection that is closed with bytes

@@ -25,7 +25,7 @@ use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpListener, UnixListener};
 use tokio::sync::{Semaphore, watch};
 
-/// How long requests that are under way when the service ends get, and clients to hear that it ends.
+/// Time that requests under way get when the service ends, and clients to hear that it ends.
 const STOP_TIMEOUT: Duration = Duration::from_millis(500);
 /// The pause after a connection could not be accepted, which is when the process is out of file descriptors.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
