@@ -62,6 +62,7 @@ def test_a_configuration_is_read_and_defaults_fill_it() -> None:
             ('kind = "tiny"\n[train]\ncrop = [64, 96]', 'kind = "cdm"\n[train]\nloss.space = "fill"\ncrop = [56, 98]'),
             ["loss.space", "tiny alone"],
         ),
+        (("loss.gradient = 1", "loss.steady = 0.1"), ["loss.steady", 'loss.space = "fill"']),
         (("[model]", "[model"), ["line 10"]),
         (("[model]", "[modle]"), ["line 10", "modle"]),
     ],

@@ -219,7 +219,9 @@ def test_real_regions_compare_what_was_hidden_with_what_was_measured(tmp_path: P
         gates.real(identity(), of, broken, draws=1)
 
 
-def test_the_recipe_writes_both_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_recipe_writes_both_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     pytest.importorskip("onnx")
     import tomllib
 
@@ -255,6 +257,22 @@ def test_the_recipe_writes_both_files(tmp_path: Path, monkeypatch: pytest.Monkey
     assert record["train"]["steps"] == 5
     assert record["train"]["seed"] == 4
     assert record["metrics"]["held-out"]["all"]["pixels"] > 0
+    assert "train-before" not in record
+
+    # A second run goes on from the weights of the first.
+    after = tmp_path / "after.toml"
+    text = path.read_text().replace('folder = "run"', 'folder = "after"').replace("width = 8", 'width = 8\nweights = "run/model.pt"')
+    after.write_text(text.replace("steps = 5", "steps = 2\nloss.steady = 0.1"))
+    train.run(config.read(after))
+    assert ship.main([str(after), *command[1:]]) == 0
+    record = tomllib.loads((tmp_path / "out" / "tiny.toml").read_text())
+    assert record["train-before"]["steps"] == 5
+    assert record["train"]["steps"] == 2
+    assert record["train"]["loss"]["steady"] == 0.1
+    (tmp_path / "run" / "run.json").rename(tmp_path / "elsewhere.json")
+    assert ship.main([str(after), *command[1:]]) == 1
+    assert "what ships says how its first weights were made" in capsys.readouterr().err
+    (tmp_path / "elsewhere.json").rename(tmp_path / "run" / "run.json")
     monkeypatch.setattr(ship, "BYTES_MAX", 10)
     (tmp_path / "out" / "tiny.toml").unlink()
     assert ship.main(command) == 1, "too large"

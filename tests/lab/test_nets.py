@@ -97,7 +97,8 @@ def batch(height: int = 64, width: int = 96, seed: int = 1) -> tuple[Any, Any, A
     g = torch.Generator().manual_seed(seed)
     color = torch.rand(2, 3, height, width, generator=g)
     filled = 0.3 + torch.rand(2, height, width, generator=g)
-    raw = torch.where(torch.rand(2, height, width, generator=g) < 0.3, 0, filled)
+    hole = torch.rand(2, height // 8, width // 8, generator=g) < 0.3
+    raw = torch.where(hole.repeat_interleave(8, 1).repeat_interleave(8, 2), 0, filled)
     return color, filled, raw
 
 
@@ -114,8 +115,8 @@ def test_tiny_multiplies_in_holes_and_keeps_what_was_measured() -> None:
     count = sum(p.numel() for p in net.parameters())
     assert 500_000 <= count <= 1_000_000
     color, filled, raw = batch()
-    # Filling took this one out.
-    raw[0, 5, 7] = 2 * filled[0, 5, 7]
+    # Filling took these out.
+    raw[0, 16:24, 16:24] = 2 * filled[0, 16:24, 16:24]
     with torch.no_grad():
         net = shaken(net)
         x = tiny_inputs(color, filled, raw)
@@ -125,7 +126,7 @@ def test_tiny_multiplies_in_holes_and_keeps_what_was_measured() -> None:
         assert 0.6 < kept.float().mean() < 0.8
         assert (ratio[kept] == 0).all()
         assert ratio[~kept].std() > 0.05
-        assert ratio[0, 5, 7] != 0
+        assert (ratio[0, 16:24, 16:24] != 0).any()
         assert ratio.abs().max() <= 2.0001
         torch.testing.assert_close(net(x, 3 * filled), 3 * out)
         # Inputs are free of the scale of the scene.
@@ -145,6 +146,28 @@ def test_tiny_begins_on_the_way_from_filled_depth_to_the_plane_around() -> None:
         # All three guesses are the plane: 3 parts of sigmoid(-2), less what is too little to move.
         expected = 3 / (1 + math.exp(2)) * math.log(2) - STAY
         torch.testing.assert_close((out / filled).log()[hole], torch.full([32 * 32], expected), atol=0.01, rtol=0)
+
+
+def test_tiny_leaves_narrow_holes_as_they_were_filled() -> None:
+    _, filled, _ = batch()
+    holes = torch.zeros_like(filled, dtype=torch.bool)
+    holes[:, 8:12, 8:12] = True
+    holes[:, 20:24, 30:38] = True
+    holes[:, :, 60] = True
+    wide = torch.zeros_like(holes)
+    wide[:, 40:45, 8:13] = True
+    wide[:, 0:5, 80:90] = True
+    # A corner of a wide hole that no square of 5x5 reaches.
+    holes[:, 43:46, 13:15] = True
+    raw = torch.where(holes | wide, 0, filled)
+    with torch.no_grad():
+        net = shaken(Tiny()).eval()
+        x = tiny_inputs(torch.zeros(2, 3, *filled.shape[1:]), filled, raw)
+        ratio = net(x, filled) / filled
+        learning = net.train()(x, filled) / filled
+    assert (ratio[~wide] == 1).all()
+    assert (ratio[wide] != 1).float().mean() > 0.5
+    assert (learning[holes] != 1).any()
 
 
 def slow_plane(q: Any, known: Any, y: int, x: int, power: float) -> float:

@@ -402,6 +402,64 @@ def test_the_loss_beside_fill_is_its_definition() -> None:
     assert of[0].grad.isfinite().all()
 
 
+def test_the_loss_of_unsteady_depth_is_its_definition() -> None:
+    rng = np.random.default_rng(5)
+    filled, p = rng.uniform(0.3, 2, (6, 7, 9)), rng.uniform(0.3, 2, (6, 7, 9))
+    raw = np.where(rng.random(filled.shape) < 0.4, 0, 1.0)
+    raw[2] = 1.0  # without a hole
+    filled[4, :3] = 0
+    c = config.LossConfig(space="fill", steady=1.0, far_m=2.5)
+    parts = []
+    for i in range(3):
+        changes: dict[str, list[float]] = {"filled": [], "p": []}
+        for y, x in np.argwhere(raw[i] == 0):
+            if min(filled[i, y, x], filled[3 + i, y, x]) * 2.5 >= 1:
+                for name, of in (("filled", filled), ("p", p)):
+                    changes[name].append(abs(1 / of[i, y, x] - 1 / of[3 + i, y, x]))
+        mean = {name: sum(each) / max(len(each), 1) for name, each in changes.items()}
+        parts.append(mean["p"] / (mean["filled"] + 0.002))
+    assert parts[0] > 0.3
+    assert parts[2] == 0
+    of = [torch.from_numpy(a) for a in (p, raw, filled)]
+    of[0].requires_grad_()
+    got = losses.unsteady_loss(*of, c)
+    assert got.item() == pytest.approx(np.mean(parts), abs=1e-9)
+    got.backward()
+    assert of[0].grad.isfinite().all()
+
+
+def test_a_crop_comes_twice_with_the_noise_of_the_sensor(tmp_path: Path) -> None:
+    make_shards(tmp_path / "data")
+    options = {"crop": [32, 48], "batch": 3, "loss.space": "fill"}
+    first = config.read(make_config(tmp_path, "first", **options))
+    twice = config.read(make_config(tmp_path, "twice", **options, **{"loss.steady": 0.1}))
+    sources = [open_source(config.DataConfig("shards", str(tmp_path / "data")))]
+    alone, both = batches.Batches(sources, first)[5], batches.Batches(sources, twice)[5]
+    assert both["names"] == 2 * alone.pop("names")
+    for name, plane in alone.items():
+        torch.testing.assert_close(both[name][:3], plane, rtol=0, atol=0)
+    once, again = ({n: p.numpy()[of] for n, p in both.items() if n != "names"} for of in (np.s_[:3], np.s_[3:]))
+    np.testing.assert_array_equal(once["truth"], again["truth"])
+    assert not np.array_equal(once["color"], again["color"])
+    np.testing.assert_allclose(once["color"], again["color"], atol=2.001 / 255)
+    assert not (again["raw"][once["raw"] == 0] > 0).any()
+    same = batches.Batches(sources, twice)[5]
+    assert all(torch.equal(both[n], same[n]) for n in once)
+
+    # A wall of many cells: as much noise as is said, and filled depth as filling the other image gives it.
+    wall = np.full((400, 600), 2.0, np.float32)
+    wall[100:180, 100:220] = 0
+    planes = {"raw": wall, "filled": fill(np.where(wall > 0, 0.5, 0)), "truth": wall, "color": np.zeros((3, *wall.shape), np.float32)}
+    noisy = batches.again(batches.Example("wall", planes), np.random.default_rng(1)).planes
+    left = noisy["raw"] > 0
+    assert (1 / noisy["raw"][left]).std() == pytest.approx(0.1 / (0.05 * 385), rel=0.03)
+    assert left[wall > 0].mean() == pytest.approx(0.99, abs=0.004)
+    np.testing.assert_allclose(noisy["filled"], fill(np.where(left, 1 / np.where(left, noisy["raw"], 1), 0)), rtol=1e-4)
+    off = noisy["raw"][0::4, 0::4]
+    for y, x in ((1, 2), (3, 3)):
+        np.testing.assert_array_equal(noisy["raw"][y::4, x::4], off)
+
+
 def test_the_losses_of_noise_models() -> None:
     rng = np.random.default_rng(2)
     logits, raw = (

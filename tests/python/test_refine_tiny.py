@@ -121,6 +121,14 @@ def test_a_rig_publishes_what_tiny_gives(binary: str, runtime: Path, model: str,
     assert (published != run("fill")).any(), "the network does something"
 
 
+@pytest.mark.parametrize("size", ["640x480", "1280x720"])
+def test_depth_of_a_still_scene_is_as_steady_as_that_of_fill(binary: str, runtime: Path, model: str, size: str) -> None:
+    words = ("--seconds", "0", "--threads", "1", "--image", size, "--flicker", "12", "--json")
+    fill, tiny = (row["flicker"] for row in json.loads(command(binary, runtime, "cdm", "bench", *words)))
+    assert tiny["refined_mm"] <= 1.001 * fill["refined_mm"], (fill, tiny)
+    assert tiny["holes_mm"] <= fill["holes_mm"], (fill, tiny)
+
+
 def test_without_the_library_the_reason_and_the_cure_are_in_the_status(
     binary: str, runtime: Path, tmp_path: Path
 ) -> None:

@@ -16,14 +16,23 @@ from torch.utils.data import DataLoader, Dataset
 from .config import Config
 from .data import Source
 from .errors import LabError
-from .fill import filled_of
+from .fill import fill, filled_of, inverse_of
 from .sample import Sample
 from .synthesis import synthesise
 
-__all__ = ["Batches", "Example", "batch_of", "check_use", "example", "is_blank", "loader", "raw_of", "seen_of"]
+__all__ = ["Batches", "Example", "again", "batch_of", "check_use", "example", "is_blank", "loader", "raw_of", "seen_of"]
 
 ATTEMPTS = 100
 """After so many samples in a row without true depth the dataset is refused."""
+
+AGAIN_PER_M = 0.1 / (0.05 * 385)
+"""Measured again, inverse depth is off by so much, 1/m: a tenth of a pixel of disparity of a D435."""
+AGAIN_CELL = 4
+"""It is off alike over so many pixels: a stereo camera compares windows."""
+AGAIN_GONE = 0.01
+"""Share of these cells that become holes."""
+AGAIN_COLOR = 2 / 255
+"""Colour is off by so much at most."""
 
 Planes = dict[str, npt.NDArray[Any]]
 
@@ -111,6 +120,32 @@ def example(sample: Sample, config: Config, rng: np.random.Generator) -> Example
     return Example(sample.name, {name: np.ascontiguousarray(plane) for name, plane in planes.items()})
 
 
+def again(first: Example, rng: np.random.Generator) -> Example:
+    """Return a crop of a still scene measured again: other noise of colour and raw depth, and what that changes in filled depth.
+
+    The change is that of the stand-in for `fill`: it follows from what was measured around, as with any pyramid.
+    """
+    planes = dict(first.planes)
+    height, width = planes["raw"].shape
+    cells = (-(-height // AGAIN_CELL), -(-width // AGAIN_CELL))
+
+    def each(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        return values.repeat(AGAIN_CELL, 0).repeat(AGAIN_CELL, 1)[:height, :width]
+
+    off = each(AGAIN_PER_M * rng.standard_normal(cells, np.float32))
+    gone = each(rng.random(cells, np.float32) < AGAIN_GONE)
+    once = inverse_of(planes["raw"])
+    # Far depth that noise would put at infinity stays near it.
+    twice = np.where((once > 0) & ~gone, np.maximum(once + off, 0.5 * once), 0)
+    planes["raw"] = inverse_of(twice)
+    of_once, of_twice = fill(once), fill(twice)
+    change = np.where((of_once > 0) & (of_twice > 0), of_twice / np.maximum(of_once, 1e-6), 1)
+    planes["filled"] = (planes["filled"] * change).astype(np.float32)
+    color = planes["color"] + AGAIN_COLOR * (2 * rng.random(planes["color"].shape, np.float32) - 1)
+    planes["color"] = color.clip(0, 1)
+    return Example(first.name, planes)
+
+
 def batch_of(examples: Sequence[Example]) -> dict[str, Any]:
     """Return tensors of several examples, with their names."""
     planes = {name: torch.from_numpy(np.stack([e.planes[name] for e in examples])) for name in examples[0].planes}
@@ -151,6 +186,9 @@ class Batches(Dataset):  # type: ignore[type-arg,unused-ignore]
         for position in range(first, first + size):
             rng = np.random.default_rng([self.config.seed, 2, position])
             examples.append(example(self._with_truth(position), self.config, rng))
+        if self.config.train.loss.steady > 0:
+            draws = (np.random.default_rng([self.config.seed, 6, p]) for p in range(first, first + size))
+            examples += [again(each, rng) for each, rng in zip(examples, draws, strict=True)]
         return batch_of(examples)
 
     def _with_truth(self, position: int) -> Sample:

@@ -115,6 +115,8 @@ class LossConfig:
     """`fill`: weight of how much worse an image became."""
     off_m: float = 0.1
     """`fill`: added to filled depth's error where the change is a part of it, metres. The more, the more do images with large errors count."""
+    steady: float = 0.0
+    """`fill`: weight of how much depth in holes changes with the sensor's noise. Above 0 each crop comes twice, measured again."""
     near_m: float = 0.1
     far_m: float = 6.0
 
@@ -122,6 +124,7 @@ class LossConfig:
         _one_of("space", self.space, ("inverse", "log", "fill"))
         _within("worse", self.worse, 0, 100)
         _within("off_m", self.off_m, 0.001, 100)
+        _within("steady", self.steady, 0, 100)
         _within("gradient", self.gradient, 0, 100)
         _within("missing", self.missing, 0.01, 100)
         _within("near_m", self.near_m, 0.01, 100)
@@ -212,6 +215,8 @@ class Config:
             )
         if self.train.loss.space == "fill" and self.model.kind != "tiny":
             raise LabError(f'loss.space = "fill" is for tiny alone; use "inverse" or "log" for {self.model.kind}')
+        if self.train.loss.steady > 0 and self.train.loss.space != "fill":
+            raise LabError('loss.steady needs loss.space = "fill"')
         if self.train.flip and self.synthesis.sensor != "tof":
             raise LabError('flip = true needs sensor = "tof": a stereo camera misses what lies left of things')
 

@@ -8,13 +8,17 @@ from torch import Tensor
 
 from .config import LossConfig
 
-__all__ = ["beside_fill_loss", "hole_loss", "refine_loss", "value_loss"]
+__all__ = ["beside_fill_loss", "hole_loss", "refine_loss", "unsteady_loss", "value_loss"]
 
 WRONG = 0.05
 """Raw depth that is off by more than this share of the truth counts as missing."""
 
 WORSE_OFF_M = 0.01
 """Added to the L1 of filled depth over an image of which it is a denominator."""
+
+
+STEADY_M = 0.002
+"""Added to the change of filled depth of which that of refined depth is a part."""
 
 
 def inverse(depth: Tensor) -> Tensor:
@@ -41,6 +45,23 @@ def beside_fill_loss(predicted: Tensor, truth: Tensor, filled: Tensor, config: L
     change = error(predicted) - before
     worse = change.clamp_min(0) / (before + WORSE_OFF_M)
     return (change / (before + config.off_m) + config.worse * worse).mean()
+
+
+def unsteady_loss(predicted: Tensor, raw: Tensor, filled: Tensor, config: LossConfig) -> Tensor:
+    """Return the mean over crops of how much depth in holes changes when the sensor measures again, as a part of filled depth's change.
+
+    :param predicted: `(2 * batch, height, width)`, 1/m, as `filled`; the second half is of the same crops, measured again.
+    :param raw: metres, 0 for a hole.
+    """
+    once, again = filled.chunk(2)
+    hole = (raw.chunk(2)[0] <= 0) & (once * config.far_m >= 1) & (again * config.far_m >= 1)
+    count = hole.sum((1, 2)).clamp_min(1)
+
+    def change(of: Tensor) -> Tensor:
+        one, two = (1 / half.clamp_min(1e-3) for half in of.chunk(2))
+        return torch.where(hole, one - two, 0.0).abs().sum((1, 2)) / count
+
+    return (change(predicted) / (change(filled) + STEADY_M)).mean()
 
 
 def refine_loss(predicted: Tensor, truth: Tensor, raw: Tensor, config: LossConfig) -> Tensor:

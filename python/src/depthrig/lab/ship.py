@@ -26,7 +26,7 @@ __all__ = ["BYTES_MAX", "main", "record", "ship"]
 BYTES_MAX = 4 << 20
 """Size of `tiny.onnx` at most: it is embedded in the program."""
 LICENCE = "MIT OR Apache-2.0"
-VERSION = 3
+VERSION = 4
 """Goes up with each network that ships."""
 
 
@@ -65,11 +65,28 @@ def _arguments(folder: Path) -> dict[str, Any]:
     return {}
 
 
+def _run_before(config: Config) -> dict[str, Any] | None:
+    """Return `run.json` of the run that made the weights with which this one began; None where it began with none.
+
+    :raises LabError: when it is not beside them.
+    """
+    if config.model.weights is None:
+        return None
+    path = Path(config.model.weights).parent / "run.json"
+    try:
+        found = json.loads(path.read_text())
+    except (OSError, ValueError) as e:
+        raise LabError(f"{path}: {e}; what ships says how its first weights were made: keep it beside them") from None
+    assert isinstance(found, dict)
+    return found
+
+
 def record(config: Config, run: dict[str, Any], found: dict[str, Any], gates: dict[str, Any], onnx: bytes) -> str:
     """Return `tiny.toml`.
 
     :param run: `run.json`.
     :param found: what `measure_all` found; `gates` is what `judge` made of it.
+    :raises LabError: when the run that made the first weights left no `run.json`.
     """
     lines = [
         "# Record of tiny.onnx, written by `make train-tiny`.",
@@ -94,8 +111,10 @@ def record(config: Config, run: dict[str, Any], found: dict[str, Any], gates: di
             path = Path(each.path)
             hashed = next((h for name, h in run["data"].items() if name.endswith(f" {path}")), None)
             lines += _table(f"{of}.{_key(path.name)}", {"sha256": hashed, **_arguments(path)})
-    train = dict(run["config"]["train"])
-    lines += _table("train", {"seed": config.seed, "processes": run["config"]["processes"], **train})
+    for name, of in (("train-before", _run_before(config)), ("train", run)):
+        if of is not None:
+            made = of["config"]
+            lines += _table(name, {"seed": made["seed"], "processes": made["processes"], **made["train"]})
     lines += _table("versions", run["versions"])
     return "\n".join(lines) + "\n"
 

@@ -74,7 +74,11 @@ def loss_of(predicted: Tensor, batch: dict[str, Any], config: Config) -> Tensor:
     if config.model.kind == "value":
         return losses.value_loss(predicted, batch["raw"], stereo=config.synthesis.sensor != "tof")
     if config.train.loss.space == "fill":
-        return losses.beside_fill_loss(predicted, batch["truth"], batch["filled"], config.train.loss)
+        loss = losses.beside_fill_loss(predicted, batch["truth"], batch["filled"], config.train.loss)
+        if config.train.loss.steady > 0:
+            unsteady = losses.unsteady_loss(predicted, batch["raw"], batch["filled"], config.train.loss)
+            loss = loss + config.train.loss.steady * unsteady
+        return loss
     return losses.refine_loss(predicted, batch["truth"], batch["raw"], config.train.loss)
 
 

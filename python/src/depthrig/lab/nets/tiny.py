@@ -29,6 +29,9 @@ REACH = 2.0
 """The largest |r|."""
 STAY = 0.02
 """|r| becomes smaller by this, down to 0."""
+LEAST_HOLE = 5
+"""Side of a square, pixels: where none fits into a hole, it stays as `fill` has it, but for training. What is measured in one image
+and missing in the next would flicker."""
 KEPT = 1e-3
 """Measured depth that filling changed by more than this part was wrong, and counts as a hole."""
 
@@ -43,6 +46,12 @@ def tiny_inputs(color: Tensor, filled: Tensor, raw: Tensor) -> Tensor:
     mean = filled.mean((1, 2), keepdim=True).clamp_min(1e-6)
     depths = torch.stack([filled / mean, raw / mean, (raw > 0).to(filled.dtype)], 1)
     return torch.cat([color - 0.5, depths], 1)
+
+
+def _wide(known: Tensor) -> Tensor:
+    """Return 1 in holes as far as squares of `LEAST_HOLE` that fit into them reach, else 0."""
+    around = (LEAST_HOLE, 1, LEAST_HOLE // 2)
+    return F.max_pool2d(1 - F.max_pool2d(known, *around), *around)
 
 
 def _norm(channels: int) -> nn.GroupNorm:
@@ -121,5 +130,6 @@ class Tiny(nn.Module):
             ways = (guesses / here).log().clamp(-REACH, REACH)
             r = (torch.sigmoid(parts[:, :-1]) * ways).sum(1, keepdim=True) + parts[:, -1:]
             r = r.clamp(-REACH, REACH)
-            r = hole * (r - r.clamp(-STAY, STAY))
+            # Narrow holes teach, too.
+            r = (hole if self.training else _wide(known)) * (r - r.clamp(-STAY, STAY))
             return filled * torch.exp(r.squeeze(1))
