@@ -404,7 +404,7 @@ def test_the_loss_beside_fill_is_its_definition() -> None:
 
 def test_the_loss_of_unsteady_depth_is_its_definition() -> None:
     rng = np.random.default_rng(5)
-    filled, p = rng.uniform(0.3, 2, (6, 7, 9)), rng.uniform(0.3, 2, (6, 7, 9))
+    filled, p = rng.uniform(0.3, 2, (6, 7, 9)), rng.uniform(0.2, 2, (6, 7, 9))
     raw = np.where(rng.random(filled.shape) < 0.4, 0, 1.0)
     raw[2] = 1.0  # without a hole
     filled[4, :3] = 0
@@ -417,8 +417,8 @@ def test_the_loss_of_unsteady_depth_is_its_definition() -> None:
                 for name, of in (("filled", filled), ("p", p)):
                     changes[name].append(abs(1 / of[i, y, x] - 1 / of[3 + i, y, x]))
         mean = {name: sum(each) / max(len(each), 1) for name, each in changes.items()}
-        parts.append(mean["p"] / (mean["filled"] + 0.002))
-    assert parts[0] > 0.3
+        parts.append(max(mean["p"] / (mean["filled"] + 0.002) - 0.8, 0))
+    assert max(parts) > 0.05
     assert parts[2] == 0
     of = [torch.from_numpy(a) for a in (p, raw, filled)]
     of[0].requires_grad_()

@@ -17,6 +17,8 @@ WORSE_OFF_M = 0.01
 """Added to the L1 of filled depth over an image of which it is a denominator."""
 
 
+STEADY = 0.8
+"""Depth in holes may change by this part of what filled depth does."""
 STEADY_M = 0.002
 """Added to the change of filled depth of which that of refined depth is a part."""
 
@@ -48,7 +50,8 @@ def beside_fill_loss(predicted: Tensor, truth: Tensor, filled: Tensor, config: L
 
 
 def unsteady_loss(predicted: Tensor, raw: Tensor, filled: Tensor, config: LossConfig) -> Tensor:
-    """Return the mean over crops of how much depth in holes changes when the sensor measures again, as a part of filled depth's change.
+    """Return the mean over crops of how much depth in holes changes when the sensor measures again, as a part of filled
+    depth's change and beyond `STEADY` of it.
 
     :param predicted: `(2 * batch, height, width)`, 1/m, as `filled`; the second half is of the same crops, measured again.
     :param raw: metres, 0 for a hole.
@@ -61,7 +64,7 @@ def unsteady_loss(predicted: Tensor, raw: Tensor, filled: Tensor, config: LossCo
         one, two = (1 / half.clamp_min(1e-3) for half in of.chunk(2))
         return torch.where(hole, one - two, 0.0).abs().sum((1, 2)) / count
 
-    return (change(predicted) / (change(filled) + STEADY_M)).mean()
+    return (change(predicted) / (change(filled) + STEADY_M) - STEADY).clamp_min(0).mean()
 
 
 def refine_loss(predicted: Tensor, truth: Tensor, raw: Tensor, config: LossConfig) -> Tensor:

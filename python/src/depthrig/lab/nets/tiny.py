@@ -1,8 +1,8 @@
 """A small refiner for CPUs: multiplies filled inverse depth in holes by exp(r), |r| <= 2.
 
 Planes through what was measured (`planes`) are guesses at what lies in a hole; the network says how far to go from the
-filled depth to each of them, and what to add. What was measured stays as it was, and so does a hole of which the
-network knows little: a small r becomes 0.
+filled depth to each of them, and what to add. What was measured stays as it was, and so do narrow holes and a hole of
+which the network knows little: a small r becomes 0.
 
 It works at an eighth of the resolution and below. Every learned layer is a convolution, a group norm or an activation;
 a convolution of 8x8 with stride 8 takes pixels apart and a transposed one puts them together, which is what unshuffle
