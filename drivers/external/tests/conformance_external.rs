@@ -128,7 +128,9 @@ fn serve(session: &mut Session<'_>, shared: &Shared, orders: &Receiver<SyncSende
         if core::mem::take(&mut shared.script().reset) {
             next = now.plus_ns(-PERIOD_NS);
         }
-        let due = (now.since_ns(next) / PERIOD_NS).clamp(0, 40) as u64;
+        // What the script spoils must be read before it is replaced, however long this computer paused.
+        let most = if shared.script().spoil.is_some() { 1 } else { 40 };
+        let due = (now.since_ns(next) / PERIOD_NS).clamp(0, most) as u64;
         for i in 1..=due {
             next = next.plus_ns(PERIOD_NS);
             round(session, &running, shared, next);

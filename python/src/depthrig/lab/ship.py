@@ -111,10 +111,10 @@ def record(config: Config, run: dict[str, Any], found: dict[str, Any], gates: di
             path = Path(each.path)
             hashed = next((h for name, h in run["data"].items() if name.endswith(f" {path}")), None)
             lines += _table(f"{of}.{_key(path.name)}", {"sha256": hashed, **_arguments(path)})
-    for name, of in (("train-before", _run_before(config)), ("train", run)):
-        if of is not None:
-            made = of["config"]
-            lines += _table(name, {"seed": made["seed"], "processes": made["processes"], **made["train"]})
+    for table, each_run in (("train-before", _run_before(config)), ("train", run)):
+        if each_run is not None:
+            made = each_run["config"]
+            lines += _table(table, {"seed": made["seed"], "processes": made["processes"], **made["train"]})
     lines += _table("versions", run["versions"])
     return "\n".join(lines) + "\n"
 
