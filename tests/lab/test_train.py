@@ -455,6 +455,10 @@ def test_a_crop_comes_twice_with_the_noise_of_the_sensor(tmp_path: Path) -> None
     assert (1 / noisy["raw"][left]).std() == pytest.approx(0.1 / (0.05 * 385), rel=0.03)
     assert left[wall > 0].mean() == pytest.approx(0.99, abs=0.004)
     np.testing.assert_allclose(noisy["filled"], fill(np.where(left, 1 / np.where(left, noisy["raw"], 1), 0)), rtol=1e-4)
+    # Behind a covered lens nothing becomes known.
+    empty = {**planes, "raw": np.zeros_like(wall), "filled": np.zeros_like(wall)}
+    dark = batches.again(batches.Example("dark", empty), np.random.default_rng(1)).planes
+    assert not dark["raw"].any() and not dark["filled"].any()
     off = noisy["raw"][0::4, 0::4]
     for y, x in ((1, 2), (3, 3)):
         np.testing.assert_array_equal(noisy["raw"][y::4, x::4], off)
