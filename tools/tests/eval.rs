@@ -204,6 +204,17 @@ fn folders_are_paired_and_the_page_stands_alone() {
         "the worst three of each, three images each"
     );
 
+    // A prediction with a wrong unit is compared as it is, and doubted.
+    assert!(!home.run(&args).err.contains("unit"));
+    let said = home.run(&[&args[..], &["--unit", "0.01", "--truth-unit", "0.001"]].concat());
+    assert_eq!(said.code, 0, "{}", said.err);
+    let doubts: Vec<&str> = said.err.lines().filter(|line| line.contains("unit")).collect();
+    assert!(doubts.len() == 1 && doubts[0].starts_with("warning: sensor <raw> is "), "{}", said.err);
+    assert!(
+        doubts[0].ends_with("one may have a wrong unit; a tenth of its unit would fit (--unit)"),
+        "{doubts:?}"
+    );
+
     // A missing prediction is reported, and the others are compared.
     std::fs::remove_file(home.path().join("raw/2.png")).unwrap();
     let said = home.run(&args);

@@ -299,13 +299,18 @@ fn measure(mut run: Run<'_>, summary: &mut Summary, args: &EvalArgs, context: &C
         !stop.is_asked()
     });
     bar.clear();
+    if let Ok(Some(finished)) = &measured {
+        for doubt in &finished.doubts {
+            out::note(format_args!("warning: {doubt}"));
+        }
+    }
     match (measured, sums) {
         (Err(e), Some(sums)) if e.is::<WrongUnit>() => {
             sums.discard();
             Err(e)
         }
         (Err(e), _) => Err(e),
-        (Ok(Some(images)), Some(sums)) => sums.finish(images).map(|()| true),
+        (Ok(Some(finished)), Some(sums)) => sums.finish(finished.images).map(|()| true),
         (Ok(Some(_)), None) => Ok(true),
         (Ok(None), Some(_)) => {
             out::note("interrupted; the same command goes on where it was");

@@ -31,6 +31,14 @@ pub struct Run<'a> {
     pub done: u64,
 }
 
+/// All images of the part were measured.
+pub struct Finished {
+    /// Number of images of all parts.
+    pub images: u64,
+    /// Predictions whose unit is in doubt, in words.
+    pub doubts: Vec<String>,
+}
+
 /// A job that was read and refined.
 struct Refined {
     image: u64,
@@ -41,8 +49,7 @@ struct Refined {
 
 impl Run<'_> {
     /// Measures all images of the part that are not done, into `summary` and `sums`; `go_on` receives the progress and decides
-    /// whether to continue. Returns the number of images of all parts; `None` when it was interrupted. The result does not depend
-    /// on the number of threads.
+    /// whether to continue. Returns `None` when it was interrupted. The result does not depend on the number of threads.
     ///
     /// # Errors
     /// When an engine fails, raw depth has a wrong unit, or `sums` cannot be written.
@@ -51,7 +58,7 @@ impl Run<'_> {
         summary: &mut Summary,
         sums: &mut Option<Writer>,
         mut go_on: impl FnMut(u64, u64) -> bool,
-    ) -> Result<Option<u64>> {
+    ) -> Result<Option<Finished>> {
         let first = self.source.names().len();
         let mut units = Units::default();
         let mut next = 0;
@@ -86,8 +93,7 @@ impl Run<'_> {
                 }
             }
         }
-        units.finish()?;
-        Ok(Some(next))
+        Ok(Some(Finished { images: next, doubts: units.finish(self.source.names())? }))
     }
 
     /// Prepares what was read and runs the refiners.
