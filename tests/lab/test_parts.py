@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
+import os
+import subprocess
 import sys
+import termios
 from pathlib import Path
 
 import numpy as np
@@ -167,6 +171,25 @@ def test_parts_that_die_run_again(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "1 of 3 parts failed" in said
     assert "--shard 1/3 ended with 1: no such camera" in said
     assert ray.main(["0", "--local", "1", "--", "true"]) == 1
+
+
+def test_a_terminal_shows_how_many_parts_and_samples_are_done(tmp_path: Path) -> None:
+    pytest.importorskip("tqdm", reason="tqdm is not installed")
+    parts = ["ray", "3", "--local", "2", "--", "true"]
+    shards = ["make_shards", str(make_config(tmp_path)), str(tmp_path / "out"), "--per-shard", "2"]
+    # The second time all is there.
+    for arguments, done in ((parts, "3/3"), (shards, "5/5"), (shards, "5/5")):
+        ours, its = os.openpty()
+        termios.tcsetwinsize(its, (24, 80))
+        command = [sys.executable, "-m", f"depthrig.lab.{arguments[0]}", *arguments[1:]]
+        subprocess.run(command, stderr=its, stdout=subprocess.DEVNULL, check=True)
+        os.close(its)
+        shown = b""
+        with contextlib.suppress(OSError):  # the end of a terminal
+            while more := os.read(ours, 1 << 16):
+                shown += more
+        os.close(ours)
+        assert done in shown.decode(), shown
 
 
 def test_parts_on_ray_whose_workers_die(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import dataclasses
 import json
 import sys
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from .losses import inverse
 from .nets import NoiseConv, NoiseNet, load_weights, noise_net
 from .nets.cdm import normalise_color
 from .nets.vit import PATCH
+from .progress import Bar, bar
 from .record import fingerprint, keep
 from .sample import Sample, check_licences
 from .shards import ShardWriter, part_of, write_description
@@ -121,14 +123,18 @@ def make(config: Config, out: Path, part: tuple[int, int] = (0, 1), per_shard: i
     out.mkdir(parents=True, exist_ok=True)
     _agree(config, out, sources, per_shard)
     total = sum(len(s) for s in sources)
+    shards = {
+        out / f"{config.name}-{shard:06d}.tar": range(shard * per_shard, min(total, (shard + 1) * per_shard))
+        for shard in range(part[0], -(-total // per_shard), part[1])
+    }
     left_out = 0
-    for shard in range(part[0], -(-total // per_shard), part[1]):
-        path = out / f"{config.name}-{shard:06d}.tar"
-        if path.exists():
-            continue
-        numbers = range(shard * per_shard, min(total, (shard + 1) * per_shard))
-        with ShardWriter(path) as writer:
-            left_out += _fill(writer, sources, numbers, config, models)
+    with closing(bar(sum(map(len, shards.values())), "sample")) as progress:
+        for path, numbers in shards.items():
+            if path.exists():
+                progress.update(len(numbers))
+                continue
+            with ShardWriter(path) as writer:
+                left_out += _fill(writer, sources, numbers, config, models, progress)
     arguments = {"data": [d.path for d in config.data], "seed": config.seed, "sensor": config.synthesis.sensor}
     write_description(out, config.name, "lab", arguments, total)
     return left_out
@@ -146,7 +152,9 @@ def _agree(config: Config, out: Path, sources: Sequence[Source], per_shard: int)
     keep(out, {"name": config.name, "seed": config.seed, "per shard": per_shard, **made_by}, data)
 
 
-def _fill(writer: ShardWriter, sources: Sequence[Source], numbers: range, config: Config, models: NoiseModels) -> int:
+def _fill(
+    writer: ShardWriter, sources: Sequence[Source], numbers: range, config: Config, models: NoiseModels, progress: Bar
+) -> int:
     facts = {"sensor": config.synthesis.sensor, "sensor_model": config.synthesis.sensor, "seed": config.seed}
     left_out = 0
     for number in numbers:
@@ -157,6 +165,7 @@ def _fill(writer: ShardWriter, sources: Sequence[Source], numbers: range, config
                 break
             at -= len(source)
         sample = source[at]
+        progress.update()
         if not _usable(sample):
             left_out += 1
             continue

@@ -13,10 +13,12 @@ import signal
 import subprocess
 import sys
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import closing
 from typing import Any
 
 from .errors import LabError
+from .progress import bar
 
 __all__ = ["main", "run_local", "run_ray"]
 
@@ -57,8 +59,11 @@ def run_local(command: Sequence[str], n: int, jobs: int, retries: int = RETRIES)
                     return str(e)
         return ""
 
-    with ThreadPoolExecutor(jobs) as pool:
-        failed = [message for message in pool.map(attempt, range(n)) if message]
+    failed = []
+    with ThreadPoolExecutor(jobs) as pool, closing(bar(n, "part")) as progress:
+        for ended in as_completed([pool.submit(attempt, k) for k in range(n)]):
+            progress.update()
+            failed += [ended.result()] if ended.result() else []
     _report(failed, n)
 
 
@@ -76,11 +81,15 @@ def run_ray(command: Sequence[str], n: int, address: str | None = None, retries:
     try:
         task: Any = ray.remote(num_cpus=1, max_retries=retries, retry_exceptions=True)(_part)
         failed = []
-        for result in [task.remote(list(command), k, n) for k in range(n)]:
-            try:
-                ray.get(result)
-            except ray.exceptions.RayError as e:
-                failed.append(str(e).strip().splitlines()[-1])
+        running = [task.remote(list(command), k, n) for k in range(n)]
+        with closing(bar(n, "part")) as progress:
+            while running:
+                (ended,), running = ray.wait(running)
+                try:
+                    ray.get(ended)
+                except ray.exceptions.RayError as e:
+                    failed.append(str(e).strip().splitlines()[-1])
+                progress.update()
     finally:
         ray.shutdown()
     _report(failed, n)

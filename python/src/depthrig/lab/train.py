@@ -33,6 +33,7 @@ from .nets import build
 from .nets.cdm import normalise_color
 from .nets.export import export_tiny
 from .nets.tiny import tiny_inputs
+from .progress import bar
 from .record import fingerprint, keep, write_atomically
 from .sample import check_licences
 
@@ -280,17 +281,11 @@ class _Log:
         self.path, self.file = path, path.open("a")
         self.is_full = False
         self.board: Any = None
-        self.bar: Any = None
+        self.bar = bar(steps, "step", step)
         try:
             from torch.utils.tensorboard import SummaryWriter
 
             self.board = SummaryWriter(str(folder / "tensorboard"), purge_step=step)
-        except ImportError:
-            pass
-        try:
-            from tqdm import tqdm
-
-            self.bar = tqdm(total=steps, initial=step, unit="step", disable=None)
         except ImportError:
             pass
 
@@ -299,9 +294,8 @@ class _Log:
         if self.board is not None:
             for name in ("loss", "rate", "gradient"):
                 self.board.add_scalar(name, numbers[name], numbers["step"])
-        if self.bar is not None:
-            self.bar.update()
-            self.bar.set_postfix(loss=f"{numbers['loss']:.4f}")
+        self.bar.update()
+        self.bar.set_postfix(loss=f"{numbers['loss']:.4f}")
 
     def _kept(self, *steps: Callable[[], object]) -> None:
         """Run `steps`; a full disk costs lines and not the run."""
