@@ -75,6 +75,7 @@ lint: ## formatting and lints, as CI runs them
 	tools/cycles.py
 	tools/words.py
 	tools/docs/build.py check
+	tools/python.sh types || [ $$? -eq 77 ]
 	@if command -v cargo-deny >/dev/null; then cargo deny check; else echo "cargo-deny is not installed: licences not checked"; fi
 
 lab-demo: setup-build $(LEROBOT)/.stamp ## the depth lab in a quarter of an hour: makes scenes, trains a very small network, evaluates it, serves it live

@@ -2,6 +2,7 @@
 # Tests the Python package as users get it: builds the source archive, from it the wheel, and runs the tests.
 #
 #   tools/python.sh environments   the environments of the tests below
+#   tools/python.sh types      the types alone; 77 before the environments are there
 #   tools/python.sh versions   types, then the wheel's tests on every Python from 3.9 on that this computer has
 #   tools/python.sh torch      the tests that need PyTorch, with that of .venv-lerobot; 77 when it is not there
 #   tools/python.sh lab        the tests of depthrig.lab, with the same PyTorch; 77 when it is not there
@@ -65,10 +66,15 @@ environments() {
     echo "found: ${found[*]}; not there: $(comm -23 <(tr ' ' '\n' <<<"$wanted" | sort) <(printf '%s\n' "${found[@]}" | sort) | tr '\n' ' ')"
 }
 
+types() {
+    [ -e "$envs/tools/.stamp" ] || { echo "Python types are not checked: make environments puts mypy there"; return 77; }
+    "$envs/tools/bin/mypy" --config-file python/pyproject.toml --cache-dir "$envs/mypy" python/src
+}
+
 versions() {
     local version failed=""
     environments
-    "$envs/tools/bin/mypy" --config-file python/pyproject.toml --cache-dir "$envs/mypy" python/src
+    types
     rm -rf "$envs/dist"
     "$envs/tools/bin/python" -m build --outdir "$envs/dist" python >"$envs/build.log" 2>&1 || { cat "$envs/build.log"; return 1; }
     rm -rf python/build
@@ -158,10 +164,10 @@ oak() {
 }
 
 case ${1:-} in
-environments | versions | torch | lab | oak) "$1" ;;
+environments | types | versions | torch | lab | oak) "$1" ;;
 run-lab) "$@" ;;
 *)
-    sed -n '2,13s/^# \{0,1\}//p' "$0" >&2
+    sed -n '2,14s/^# \{0,1\}//p' "$0" >&2
     exit 2
     ;;
 esac
