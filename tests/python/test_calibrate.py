@@ -252,7 +252,9 @@ pose = { translation_m = [0.08, 0.0, 0.0] }
 def test_a_cloud_shows_whether_a_calibration_is_right(binary: str, runtime: Path, tmp_path: Path) -> None:
     rig = tmp_path / "rig.toml"
     rig.write_text(TWO)
-    command(binary, runtime, "run", str(rig), "--record", str(tmp_path / "out"), "--seconds", "1")
+    # On a busy computer a frame may be missing.
+    recording = ("run", str(rig), "--record", str(tmp_path / "out"), "--seconds", "1")
+    command(binary, runtime, *recording, codes=(0, 3))
     (dataset,) = (p.parent for p in (tmp_path / "out").rglob("session.toml"))
     ply = tmp_path / "cloud.ply"
     right = json.loads(command(binary, runtime, "cloud", str(dataset), "--out", str(ply), "--json"))

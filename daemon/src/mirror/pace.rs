@@ -1,4 +1,4 @@
-//! Whether frames of a stream come as they are or in a smaller coding: as they are while the way has room for that.
+//! The choice of each stream: frames as they are while the way has room for that, or in a smaller coding.
 
 use super::Ask;
 use core::time::Duration;

@@ -182,15 +182,15 @@ pub fn run(command: &ImportCommand, context: &Context) -> Result<Exit> {
                 }
             }
             let importer = ByteCameraImport::open(Arc::clone(&fs), &args.input, options);
-            drive(&mut importer.map_err(super::export::usage)?, fs, &args.common, context)
+            drive("import", &mut importer.map_err(super::export::usage)?, fs, &args.common, context)
         }
         ImportCommand::Rosbag(args) => {
             let importer = RosbagImport::open(&*fs, &args.input, name_of(&args.common.out));
-            drive(&mut importer.map_err(super::export::usage)?, fs, &args.common, context)
+            drive("import", &mut importer.map_err(super::export::usage)?, fs, &args.common, context)
         }
         ImportCommand::Kinect(args) => {
             let importer = KinectImport::open(&args.input, kinect(args));
-            drive(&mut importer.map_err(super::export::usage)?, fs, &args.common, context)
+            drive("import", &mut importer.map_err(super::export::usage)?, fs, &args.common, context)
         }
     }
 }
@@ -212,11 +212,17 @@ fn name_of(out: &Path) -> String {
 pub fn scenes(generator: Generator, count: u64, out: &Path, json: bool, context: &Context) -> Result<Exit> {
     let sets = SceneSets::new(generator, count, name_of(out)).map_err(super::export::usage)?;
     let common = Common { out: out.to_owned(), color_codec: Color::Raw, json };
-    drive(&mut { sets }, Arc::new(RealFs), &common, context)
+    drive("making scenes", &mut { sets }, Arc::new(RealFs), &common, context)
 }
 
-/// Runs an importer with a progress bar and prints its report.
-fn drive(importer: &mut dyn Importer, fs: Arc<dyn Fs>, common: &Common, context: &Context) -> Result<Exit> {
+/// Runs an importer with a progress bar, named by what it is `doing`, and prints its report.
+fn drive(
+    doing: &str,
+    importer: &mut dyn Importer,
+    fs: Arc<dyn Fs>,
+    common: &Common,
+    context: &Context,
+) -> Result<Exit> {
     if name_of(&common.out).is_empty() {
         return Err(UsageError(format!("invalid dataset name: {}", common.out.display())).into());
     }
@@ -228,7 +234,7 @@ fn drive(importer: &mut dyn Importer, fs: Arc<dyn Fs>, common: &Common, context:
     let stop = Stop::on_signals()?;
     let mut bar = Progress::new(context.global.quiet > 0);
     let report = import(importer, fs, &common.out, options, &mut |p| {
-        bar.set("import", p.done, p.total);
+        bar.set(doing, p.done, p.total);
         if stop.is_asked() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
     })
     .map_err(super::export::usage)?;
@@ -244,7 +250,7 @@ fn drive(importer: &mut dyn Importer, fs: Arc<dyn Fs>, common: &Common, context:
     if report.ended {
         let out = common.out.display();
         out::note(format_args!(
-            "interrupted: {out} holds what was read until then; remove it and import again"
+            "interrupted: {out} holds what was read until then; remove it and start again"
         ));
     }
     for lost in report.facts.problems.iter().chain(&report.summary.lost) {
