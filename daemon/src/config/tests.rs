@@ -533,6 +533,7 @@ fn each_problem_has_its_place_and_says_what_to_write() {
         (second("name = \"b\"\nbackend = \"realsense\"\ncolor_controls = { hue = 1 }\nstream = [{ name = \"depth\" }]"), "is set, but color is not among the streams"),
         (second("name = \"b\"\nbackend = \"realsense\"\nstream = [{ name = \"ir\" }]"), "8:11: a RealSense D400 has no stream \"ir\"; it has: depth, color, ir_left, ir_right, imu"),
         (second("name = \"b\"\nbackend = \"realsense\"\nseed = 1"), "only another backend has it"),
+        (second("name = \"b\"\nbackend = \"synthetic\"\nmodel = \"d435\"\nstream = [{ name = \"color\", width = 320, height = 240 }]"), ": [[camera]] \"b\": it has no such mode of \"color\"; it has: color 1280x720 rgb8 30, 15, 6 Hz; color 1920x1080 rgb8 30, 15, 6 Hz; "),
         (second("name = \"b\"\nbackend = \"zed\"\nexposure_percent = 101"), "8:20: \"exposure_percent\" in [[camera]] \"b\" is 101; it must be within 0 and 100"),
         (second("name = \"b\"\nbackend = \"zed\"\nauto_exposure = true\ngain_percent = 16"), "9:16: \"gain_percent\" in [[camera]] \"b\" cannot be set while auto_exposure is true"),
         (second("name = \"b\"\nbackend = \"zed\"\ncalibration = \"\""), "8:15: \"calibration\" in [[camera]] \"b\" is empty"),

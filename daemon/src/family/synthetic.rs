@@ -213,8 +213,10 @@ fn problem_of(change: impl FnOnce(&mut SyntheticConfig)) -> Option<String> {
     change(&mut config);
     let text = profiles(&config).err()?.to_string();
     // The driver names the camera, which here is the default one; the caller knows the real one.
-    let what = text.strip_prefix("synthetic camera ").and_then(|t| t.split_once(": "));
-    Some(what.map_or_else(|| text.clone(), |(_, what)| what.to_owned()))
+    Some(match text.strip_prefix(&config.label()) {
+        Some(what) => what.strip_prefix(": ").map_or_else(|| format!("it{what}"), str::to_owned),
+        None => text,
+    })
 }
 
 impl CameraSettings for SyntheticConfig {

@@ -140,12 +140,40 @@ impl StreamProfile {
 
     /// `depth 1280x720 z16 30 Hz`, for messages; of an IMU `imu motion 200 Hz in batches of up to 8`.
     pub fn describe(&self) -> String {
-        let Self { stream, width, height, rate_hz, .. } = self;
         if self.format.is_motion() {
-            return format!("{stream} motion {} Hz in batches of up to {width}", self.samples_hz());
+            return format!(
+                "{} motion {} Hz in batches of up to {}",
+                self.stream,
+                self.samples_hz(),
+                self.width
+            );
         }
-        format!("{stream} {width}x{height} {} {rate_hz} Hz", self.format.name())
+        format!("{} {} Hz", self.image(), self.rate_hz)
     }
+
+    fn image(&self) -> String {
+        format!("{} {}x{} {}", self.stream, self.width, self.height, self.format.name())
+    }
+}
+
+/// `depth 1280x720 z16 30, 15, 6 Hz; depth 848x480 z16 90 Hz`: modes that differ in their rate alone are one.
+fn describe_all<'a>(profiles: impl Iterator<Item = &'a StreamProfile>) -> String {
+    let mut modes: Vec<(String, Vec<String>)> = Vec::new();
+    for p in profiles {
+        if p.format.is_motion() {
+            modes.push((p.describe(), Vec::new()));
+            continue;
+        }
+        let image = p.image();
+        match modes.iter_mut().find(|(of, _)| *of == image) {
+            Some((_, rates)) => rates.push(p.rate_hz.to_string()),
+            None => modes.push((image, vec![p.rate_hz.to_string()])),
+        }
+    }
+    let shown = |(of, rates): &(String, Vec<String>)| {
+        if rates.is_empty() { of.clone() } else { format!("{of} {} Hz", rates.join(", ")) }
+    };
+    modes.iter().map(shown).collect::<Vec<_>>().join("; ")
 }
 
 /// A device's clock as its counter presents it.
@@ -220,13 +248,12 @@ pub fn choose_profiles(
     }
     for r in requests {
         let profile = available.iter().find(|p| r.fits(p)).ok_or_else(|| {
-            let same: Vec<_> = available.iter().filter(|p| p.stream == r.stream).collect();
-            let shown = if same.is_empty() { available.iter().collect() } else { same };
-            let modes: Vec<_> = shown.into_iter().map(StreamProfile::describe).collect();
+            let is_known = available.iter().any(|p| p.stream == r.stream);
+            let modes = describe_all(available.iter().filter(|p| !is_known || p.stream == r.stream));
             let stream = &r.stream;
             Error::new(
                 ErrorKind::Unsupported,
-                format!("{device} has no such mode of \"{stream}\"; it has: {}", modes.join(", ")),
+                format!("{device} has no such mode of \"{stream}\"; it has: {modes}"),
             )
         })?;
         if chosen.iter().any(|c| c.stream == profile.stream) {

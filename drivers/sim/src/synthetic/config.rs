@@ -255,7 +255,7 @@ impl SyntheticConfig {
     }
 
     /// How messages name the camera.
-    pub(crate) fn label(&self) -> String {
+    pub fn label(&self) -> String {
         format!("synthetic camera {} ({})", self.serial_or_default(), self.model)
     }
 

@@ -57,15 +57,9 @@ impl Content {
 pub(crate) fn model_of(config: &SyntheticConfig) -> Result<&'static Model> {
     models::find(&config.model).ok_or_else(|| {
         let names: Vec<_> = MODELS.iter().map(|m| m.name).collect();
-        Error::new(
-            ErrorKind::BadInput,
-            format!(
-                "synthetic camera {}: there is no model \"{}\"; there are {}",
-                config.serial_or_default(),
-                config.model,
-                names.join(", ")
-            ),
-        )
+        let label = config.label();
+        let text = format!("{label}: there is no model \"{}\"; there are {}", config.model, names.join(", "));
+        Error::new(ErrorKind::BadInput, text)
     })
 }
 
@@ -237,7 +231,10 @@ mod tests {
         c.streams[0].size = Some((850, 480));
         let e = profiles(&c).unwrap_err();
         assert_eq!(e.kind(), ErrorKind::Unsupported);
-        assert!(e.to_string().contains("depth 1280x720 z16 30 Hz"), "{e}");
+        assert!(
+            e.to_string().contains("; it has: depth 1280x720 z16 30, 15, 6 Hz; depth 848x480 z16 "),
+            "{e}"
+        );
         c.cheap = true;
         assert_eq!(default_profiles(&c).unwrap()[1].describe(), "depth 850x480 z16 60 Hz");
     }
