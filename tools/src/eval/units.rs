@@ -51,7 +51,11 @@ impl Units {
         }
         let Some((_, raw)) = &image.raw else { return Ok(()) };
         let seen = self.raw.entry(image.group.clone()).or_default();
-        if seen.add(&raw.metres(), &image.truth) { seen.check(&image.group) } else { Ok(()) }
+        if seen.images == LOOKED_AT {
+            return Ok(());
+        }
+        seen.add(&raw.metres(), &image.truth);
+        if seen.images == LOOKED_AT { seen.check(&image.group) } else { Ok(()) }
     }
 
     /// Checks groups of fewer images. Returns the predictions that are off as much, in words; `names` are those of the rows.
@@ -76,17 +80,16 @@ impl Units {
 }
 
 impl Seen {
-    /// Looks at an image if it is one of the first. Returns whether it is the last of these.
-    fn add(&mut self, depth: &Metres, truth: &Metres) -> bool {
+    /// Looks at an image if it is one of the first.
+    fn add(&mut self, depth: &Metres, truth: &Metres) {
         if self.images == LOOKED_AT {
-            return false;
+            return;
         }
         let pairs = depth.pixels.iter().zip(&truth.pixels);
         let both = pairs.filter(|(d, t)| d.is_finite() && **d > 0.0 && t.is_finite() && **t > 0.0);
         self.images += 1;
         self.empty += usize::from(depth.pixels.iter().all(|d| d.is_nan() || *d <= 0.0));
         self.ratios.extend(median(both.map(|(d, t)| f64::from(*d) / f64::from(*t)).collect()));
-        self.images == LOOKED_AT
     }
 
     /// The median against the truth, if it is off by more than the factor.
