@@ -154,26 +154,26 @@ impl StreamProfile {
     fn image(&self) -> String {
         format!("{} {}x{} {}", self.stream, self.width, self.height, self.format.name())
     }
-}
 
-/// `depth 1280x720 z16 30, 15, 6 Hz; depth 848x480 z16 90 Hz`: modes that differ in their rate alone are one.
-fn describe_all<'a>(profiles: impl Iterator<Item = &'a StreamProfile>) -> String {
-    let mut modes: Vec<(String, Vec<String>)> = Vec::new();
-    for p in profiles {
-        if p.format.is_motion() {
-            modes.push((p.describe(), Vec::new()));
-            continue;
+    /// `depth 1280x720 z16 30, 15, 6 Hz; depth 848x480 z16 90 Hz`, for messages: modes that differ in their rate alone are one.
+    pub fn describe_all<'a>(profiles: impl Iterator<Item = &'a Self>) -> String {
+        let mut modes: Vec<(String, Vec<String>)> = Vec::new();
+        for p in profiles {
+            if p.format.is_motion() {
+                modes.push((p.describe(), Vec::new()));
+                continue;
+            }
+            let image = p.image();
+            match modes.iter_mut().find(|(of, _)| *of == image) {
+                Some((_, rates)) => rates.push(p.rate_hz.to_string()),
+                None => modes.push((image, vec![p.rate_hz.to_string()])),
+            }
         }
-        let image = p.image();
-        match modes.iter_mut().find(|(of, _)| *of == image) {
-            Some((_, rates)) => rates.push(p.rate_hz.to_string()),
-            None => modes.push((image, vec![p.rate_hz.to_string()])),
-        }
+        let shown = |(of, rates): &(String, Vec<String>)| {
+            if rates.is_empty() { of.clone() } else { format!("{of} {} Hz", rates.join(", ")) }
+        };
+        modes.iter().map(shown).collect::<Vec<_>>().join("; ")
     }
-    let shown = |(of, rates): &(String, Vec<String>)| {
-        if rates.is_empty() { of.clone() } else { format!("{of} {} Hz", rates.join(", ")) }
-    };
-    modes.iter().map(shown).collect::<Vec<_>>().join("; ")
 }
 
 /// A device's clock as its counter presents it.
@@ -249,7 +249,8 @@ pub fn choose_profiles(
     for r in requests {
         let profile = available.iter().find(|p| r.fits(p)).ok_or_else(|| {
             let is_known = available.iter().any(|p| p.stream == r.stream);
-            let modes = describe_all(available.iter().filter(|p| !is_known || p.stream == r.stream));
+            let shown = available.iter().filter(|p| !is_known || p.stream == r.stream);
+            let modes = StreamProfile::describe_all(shown);
             let stream = &r.stream;
             Error::new(
                 ErrorKind::Unsupported,

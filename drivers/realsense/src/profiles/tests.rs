@@ -85,7 +85,7 @@ fn what_is_only_for_calibration_is_not_offered() {
     let all = offer(&d435());
     assert!(all.iter().all(|p| (p.width, p.height) != (1280, 800)));
     let e = planned(&[request("ir_left", Some((1280, 800)))]).unwrap_err();
-    assert!(e.to_string().contains("ir_left 848x480 mono8 15 Hz"), "it names what there is: {e}");
+    assert!(e.to_string().contains("ir_left 848x480 mono8 15, 30, 6 Hz"), "it names what there is: {e}");
 }
 
 #[test]

@@ -8,7 +8,7 @@ use core::time::Duration;
 use depthrig_bus::{DropReason, HostTime, MotionSample, Name};
 use depthrig_driver::capture::{Capture, End, Session, StopOutcome};
 use depthrig_driver::motion::LONGEST;
-use depthrig_driver::{Error, ErrorKind, Poll, Stream, StreamRequest};
+use depthrig_driver::{Error, ErrorKind, Poll, Stream, StreamProfile, StreamRequest};
 
 /// Why a case did not pass.
 pub(super) enum Stop {
@@ -178,7 +178,7 @@ fn profiles(bench: &Bench) -> Outcome {
         format: Some(wanted.format),
     };
     let stream = device.start(&[request]).map_err(failed("start"))?;
-    let got: Vec<_> = stream.profiles().iter().map(depthrig_driver::StreamProfile::describe).collect();
+    let got: Vec<_> = stream.profiles().iter().map(StreamProfile::describe).collect();
     check(got == [wanted.describe()], || format!("asked for {}, got {got:?}", wanted.describe()))
 }
 
@@ -186,12 +186,14 @@ fn unsupported(bench: &Bench) -> Outcome {
     let device = bench.backend.open(Some(&bench.serial)).map_err(failed("open"))?;
     let Some(mode) = device.profiles().first().cloned() else { return fail("the device has no mode") };
     let request = StreamRequest { size: Some((3, 1)), ..StreamRequest::any(mode.stream.clone()) };
+    let of = |p: &StreamProfile| (p.stream.clone(), p.width, p.height, p.format);
+    let named = StreamProfile::describe_all(device.profiles().iter().filter(|p| of(p) == of(&mode)));
     let nothing = Name::new("no_such_stream").map_err(|e| Stop::Failed(e.to_string()))?;
     let Err(e) = device.start(&[request]) else {
         return fail("a mode that does not exist was started");
     };
     check(e.kind() == ErrorKind::Unsupported, || format!("{:?}: {e}", e.kind()))?;
-    check(e.to_string().contains(&mode.describe()), || format!("the message does not name the modes: {e}"))?;
+    check(e.to_string().contains(&named), || format!("the message does not name the modes: {e}"))?;
     let device = bench.backend.open(Some(&bench.serial)).map_err(failed("open after a refused start"))?;
     match device.start(&[StreamRequest::any(nothing)]) {
         Ok(_) => fail("a stream that does not exist was started"),

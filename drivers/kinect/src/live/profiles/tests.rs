@@ -78,7 +78,7 @@ fn what_does_not_go_together_is_refused() {
     let small = Some((320, 288));
     let large = Some((512, 512));
     says(&[wish("depth", small, None, None), wish("ir", large, None, None)], "one sensor");
-    says(&[wish("depth", Some((1024, 1024)), Some(30.0), None)], "depth 1024x1024 z16 15 Hz");
+    says(&[wish("depth", Some((1024, 1024)), Some(30.0), None)], "depth 1024x1024 z16 15, 5 Hz");
     says(&[wish("color", Some((1920, 1080)), None, Some(PixelFormat::Nv12))], "color 1280x720 nv12");
     says(&[wish("left", None, None, None)], "left");
 }
