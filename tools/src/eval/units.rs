@@ -59,13 +59,13 @@ impl Units {
     }
 
     /// Checks groups of fewer images. Returns the predictions that are off as much, in words; `names` are those of the rows.
-    /// They are no error: a model may be that bad.
+    /// They are warnings, because a model may be that bad.
     ///
     /// # Errors
     /// As [`Self::look`].
     pub fn finish(&self, names: &[String]) -> core::result::Result<Vec<String>, WrongUnit> {
-        let few = self.raw.iter().filter(|(_, s)| s.images < LOOKED_AT);
-        few.into_iter().try_for_each(|(group, seen)| seen.check(group))?;
+        let mut few = self.raw.iter().filter(|(_, s)| s.images < LOOKED_AT);
+        few.try_for_each(|(group, seen)| seen.check(group))?;
         let doubt = |(row, seen): (&usize, &Seen)| {
             let ratio = seen.off()?;
             Some(format!(
