@@ -190,6 +190,50 @@ def test_frames_too_far_apart_make_no_group(fake_rig: FakeRig, folder: Path) -> 
 
 
 @pytest.mark.many_streams
+@pytest.mark.parametrize("lost", ["b", "ab"])
+def test_no_stream_stays_a_frame_ahead(fake_rig: FakeRig, folder: Path, lost: str) -> None:
+    """Cameras of one rate, of which c comes a period late, so that a and b are ahead at first and after a lost frame."""
+    phases = {"a": 0, "b": 6, "c": 7}
+    channels = {name: fake_rig.channel(f"{name}/depth") for name in phases}
+    r = reader(folder, *(f"{name}/depth" for name in phases))
+    captured = [{name: 1000 + 33 * i + phase for name, phase in phases.items()} for i in range(11)]
+    seen = []
+    for i in range(1, 11):
+        for name in "ab":
+            if i != 5 or name not in lost:
+                channels[name].send(captured[i][name] * MS)
+                assert r.latest() is None
+        channels["c"].send(captured[i - 1]["c"] * MS)
+        if (group := r.latest()) is not None:
+            seen.append(times(group))
+    # At first, nobody knows how soon the next frame of c comes.
+    assert seen == [captured[1] | {"c": captured[0]["c"]}, *captured[2:5], *captured[6:10]]
+
+
+@pytest.mark.many_streams
+def test_a_group_waits_for_a_frame_that_is_much_nearer(fake_rig: FakeRig, folder: Path) -> None:
+    """One camera of 15 Hz and one of 30 Hz, each second frame of which comes just behind the other's."""
+    a, b = fake_rig.channel("a/depth"), fake_rig.channel("b/depth")
+    r, partial = reader(folder), reader(folder, partial_after=0.05)
+    for ms in (934, 967):
+        a.send(ms * MS)
+    for ms in (1000, 1066, 1132):
+        b.send((ms - 2) * MS)
+        assert r.latest() is None
+        a.send(ms * MS)
+        assert times(r.next(WAIT_S)) == {"a": ms, "b": ms - 2}
+        assert r.latest() is None
+        a.send((ms + 33) * MS)
+        assert r.latest() is None
+    # The frame of a that is due does not come, and what there is was asked for.
+    assert times(partial.next(WAIT_S)) == {"a": 1132, "b": 1130}
+    b.send(1196 * MS)
+    with pytest.raises(depthrig.Timeout, match="nothing new"):
+        r.next(timeout=0.1)
+    assert times(partial.next(WAIT_S)) == {"a": 1165, "b": 1196}
+
+
+@pytest.mark.many_streams
 def test_partial_groups_are_asked_for_and_say_what_is_missing(fake_rig: FakeRig, folder: Path) -> None:
     a, b = fake_rig.channel("a/depth"), fake_rig.channel("b/depth")
     strict, lenient = reader(folder), reader(folder, partial_after=0.05)
