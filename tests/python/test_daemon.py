@@ -10,8 +10,10 @@ import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -125,6 +127,15 @@ def command(binary: str, runtime: Path, *arguments: str, codes: tuple[int, ...] 
     )
     assert done.returncode in codes, f"{arguments} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}"
     return done.stdout
+
+
+def wait_until_answers(runtime: Path, rig: str) -> None:
+    """Wait for the daemon's socket; one that is there may be another daemon's, or not listen yet."""
+    deadline = time.monotonic() + WAIT_S
+    with socket.socket(socket.AF_UNIX) as asking:
+        while asking.connect_ex(str(runtime / f"{rig}.sock")):
+            assert time.monotonic() < deadline, f"{rig} does not answer"
+            time.sleep(0.02)
 
 
 def thread_named(process_id: int, name: str) -> Path | None:

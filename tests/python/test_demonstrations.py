@@ -26,7 +26,7 @@ from depthrig.policy import Observation, PolicyLoop
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from PIL import Image
-from test_daemon import ROOT, WAIT_S, binary, command, environment, running, runtime
+from test_daemon import ROOT, WAIT_S, binary, command, environment, running, runtime, wait_until_answers
 
 __all__ = ["binary", "runtime"]
 
@@ -370,10 +370,7 @@ def replayed(binary: str, runtime: Path, dataset: Path, log: Path) -> list[tuple
     call = ["replay", str(dataset), "--as-fast-as-possible", "--paused", "-q"]
     images = {"color": "top/color", "depth": "top/depth"}
     with running(binary, runtime, log, *call):
-        deadline = time.monotonic() + WAIT_S
-        while not (runtime / "cell.sock").exists():
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
+        wait_until_answers(runtime, "cell")
         options = {"rig": "cell", "runtime_dir": runtime, "max_gap": 0.2, "max_skew": 0.1, "timeout": WAIT_S}
         with PolicyLoop(images, {"joints": "arm/joint_position"}, **options) as loop:
             command(binary, runtime, "replay", "resume")

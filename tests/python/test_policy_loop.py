@@ -27,7 +27,7 @@ from depthrig._policy_images import ReplayedImages
 from depthrig.policy import Observation, PolicyLoop, Report
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from test_daemon import ROOT, WAIT_S, binary, command, environment, running, runtime
+from test_daemon import ROOT, WAIT_S, binary, command, environment, running, runtime, wait_until_answers
 from test_signals_recorded import wait_for_sets
 
 __all__ = ["binary", "runtime"]
@@ -198,10 +198,7 @@ def replayed(
 
     call = ["replay", str(dataset), "--as-fast-as-possible", "--paused", "-q", *(["--loop"] if steps else [])]
     with running(binary, runtime, log, *call), loop(runtime, **options) as policy_loop:
-        until = time.monotonic() + WAIT_S
-        while not (runtime / "policy.sock").exists():
-            assert time.monotonic() < until
-            time.sleep(0.02)
+        wait_until_answers(runtime, "policy")
         command(binary, runtime, "replay", "resume")
         report = policy_loop.run(policy, steps=steps)
     assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))

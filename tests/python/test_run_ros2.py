@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_daemon import binary, command, running, runtime
+from test_daemon import binary, command, running, runtime, wait_until_answers
 
 __all__ = ["binary", "runtime"]
 
@@ -40,7 +40,7 @@ def rig(binary: str, runtime: Path, folder: Path, program: list[str] | None) -> 
     table = "" if program is None else f"[ros2]\ncommand = {json.dumps(program)}\n"
     path.write_text(f'rig = "bench"\n[control]\ntcp = "off"\n{table}{CAMERA}')
     with running(binary, runtime, folder / "log", "run", str(path), "-q", *([] if program else ["--ros2"])):
-        until(lambda: (runtime / "bench.sock").exists(), "the daemon")
+        wait_until_answers(runtime, "bench")
         yield
 
 
