@@ -132,7 +132,7 @@ class Skew:
         a = {f["set"]: f for f in settled if f["stream"] == "a/color"}
         b = {f["set"]: f for f in settled if f["stream"] == "b/color"}
         both = sorted(a.keys() & b.keys())
-        assert len(both) > 60
+        assert len(both) > 30
         true = [(b[s]["device_time"] - a[s]["device_time"]) * 1e-3 for s in both]
         stamped = [(b[s]["capture_time_ns"] - a[s]["capture_time_ns"]) * 1e-6 for s in both]
         self.apart_ms = statistics.median(abs(t) for t in true)

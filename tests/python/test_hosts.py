@@ -15,6 +15,7 @@ import time
 import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import groupby
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -283,10 +284,9 @@ def test_a_cut_wire_loses_nothing(rig: Rig) -> None:
     rig.ask("record", "stop")
     joined = rig.joined()
     check_joined(rig, joined, rig.data("here") / "cut", [rig.data("here") / "cut_left"])
-    # The other computer recorded all the time.
-    sets = [v for topic, v, _ in messages(joined) if topic == "/mount/frame_set"]
-    both = [v for v in sets if not v.missing]
-    assert len(both) >= len(sets) - 10
+    # The other computer recorded all the time, though a busy one leaves out some frames.
+    lacks = [bool(v.missing) for topic, v, _ in messages(joined) if topic == "/mount/frame_set"]
+    assert max((len(list(run)) for is_lacking, run in groupby(lacks) if is_lacking), default=0) < 15, "for 3 s of the cut"
 
 
 def test_a_host_that_is_killed_has_two_parts(rig: Rig) -> None:
