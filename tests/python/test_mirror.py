@@ -169,7 +169,7 @@ def one_moment(rig: Rig) -> None:
             with reader.next(timeout=WAIT_S) as group:
                 assert group.is_complete and group.skew_s <= 0.05
                 skews.append(group.skew_s)
-    # 1 / 1.6 of a period, how far apart the two streams of one camera are, and what the offset of the clocks may be wrong by.
+    # 2/3 of a period, how far apart the two streams of one camera are, and what the offset of the clocks may be wrong by.
     assert np.median(skews) < 0.0235, skews
 
 
