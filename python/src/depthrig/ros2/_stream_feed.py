@@ -92,9 +92,10 @@ class StreamFeed(Feed):
                 self.read += 1
                 self._poses.place(self._frame_id, frame.header.pose)
                 if is_motion:
-                    self._publish_batch(frame, wanted[0].publisher)
+                    # First the count: who has a sample then finds counted what is missing before it.
                     wanted[0].publisher.count.missed += (stream.missed - missed) * frame.header.width
                     missed = stream.missed
+                    self._publish_batch(frame, wanted[0].publisher)
                     continue
                 skipped = frame.sequence - last - 1 if 0 < last < frame.sequence else 0
                 last = frame.sequence
