@@ -112,9 +112,7 @@ pub unsafe extern "C" fn k4a_device_close(handle: Handle) {
         camera.running = None;
         core::mem::take(&mut camera.troubles.close_hang_ns)
     });
-    if world.census.images > 0 || world.census.captures > 0 {
-        world.census.misuse += 1;
-    }
+    world.end(at);
     drop(world);
     if let Some(ns) = hang.filter(|ns| *ns > 0) {
         sleep_until(now() + ns);
@@ -153,12 +151,13 @@ pub unsafe extern "C" fn k4a_device_get_capture(
         };
         match step {
             Step::Ready(ready) => {
+                let of = handle as usize;
                 let mut images = [None; 3];
                 for (stream, image) in ready {
-                    images[stream] = Some(world.hand_out(Thing::Image { references: 1, image }));
+                    images[stream] = Some(world.hand_out(Thing::Image { references: 1, of, image }));
                     world.census.images += 1;
                 }
-                let new = world.hand_out(Thing::Capture { references: 1, images });
+                let new = world.hand_out(Thing::Capture { references: 1, of, images });
                 world.census.captures += 1;
                 world.census.all_captures += 1;
                 // SAFETY: the caller promises that it is writable.
@@ -205,10 +204,8 @@ pub unsafe extern "C" fn k4a_device_start_cameras(
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn k4a_device_stop_cameras(handle: Handle) {
     let mut world = world();
-    if world.census.images > 0 {
-        // The real one waits for them for good.
-        world.census.misuse += 1;
-    }
+    // The real one waits for its images for good.
+    world.end(handle as usize);
     let hang = world.camera(handle as usize).map(|c| {
         c.running = None;
         core::mem::take(&mut c.troubles.stop_hang_ns)

@@ -22,15 +22,27 @@ pub struct Census {
     pub all_captures: u64,
     /// Images ever handed out.
     pub all_images: u64,
-    /// Calls with an invalid or released handle; and stops and closes while images are held.
+    /// Calls with an invalid or released handle; and stops and closes of a camera whose images are held.
     pub misuse: u64,
 }
 
 /// The object of a handle.
 pub enum Thing {
-    Camera { serial: String, is_dead: bool },
-    Capture { references: u32, images: [Option<usize>; 3] },
-    Image { references: u32, image: Image },
+    Camera {
+        serial: String,
+        is_dead: bool,
+    },
+    /// `of` is the handle of the camera that it came from.
+    Capture {
+        references: u32,
+        of: usize,
+        images: [Option<usize>; 3],
+    },
+    Image {
+        references: u32,
+        of: usize,
+        image: Image,
+    },
 }
 
 #[derive(Default)]
@@ -99,6 +111,14 @@ impl World {
     pub fn present(&self) -> Vec<usize> {
         let now = now();
         (0..self.cameras.len()).filter(|i| self.cameras[*i].absent_until <= now).collect()
+    }
+
+    /// Notes a stop or close of a camera while something is held that came from it.
+    pub fn end(&mut self, camera: usize) {
+        let is_held = |thing: &Thing| matches!(thing, Thing::Capture { of, .. } | Thing::Image { of, .. } if *of == camera);
+        if self.things.values().any(is_held) {
+            self.census.misuse += 1;
+        }
     }
 
     /// Gives one reference of an image back.
