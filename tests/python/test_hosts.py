@@ -347,6 +347,7 @@ def test_kills_at_any_moment_lose_nothing_that_was_recorded(rig: Rig) -> None:
 
 def test_a_host_that_comes_late_gets_its_part_then(rig: Rig) -> None:
     rig.start("here")
+    wait_for("its cameras", lambda: all(camera["state"] == "streaming" for camera in rig.status()["cameras"]))
     said = rig.ask("record", "start", "--name", "late", codes=(3,))
     assert "host left:" in said
     time.sleep(2)

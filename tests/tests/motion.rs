@@ -28,7 +28,7 @@ fn rig(sets_hz: f64, faults: impl FnOnce(RigText) -> RigText) -> String {
     faults(RigText::default().camera("left", IMU).camera("right", IMU)).and(&sets).text().to_owned()
 }
 
-/// What a subscriber saw of each unit, and the batches that it came too late for on a busy computer.
+/// The batches of each unit that a subscriber saw, and how many it came too late for on a busy computer.
 struct Watched([Vec<Seen>; 2], [u64; 2]);
 
 /// Collects every batch of both units until `stop`.
@@ -44,7 +44,7 @@ fn watch(home: &Home, stop: &AtomicBool) -> Watched {
         }
         std::thread::sleep(Duration::from_millis(5));
     }
-    Watched(seen, subscribers.each_ref().map(|s| s.missed()))
+    Watched(seen, subscribers.each_ref().map(depthrig_bus::Subscriber::missed))
 }
 
 /// Watches the units while `during` runs.
