@@ -179,7 +179,7 @@ def test_depth_out_of_the_range_has_the_colours_of_its_ends_and_holes_their_own(
     set_range(wall, 0.2, 4.0)
     until(lambda: len(set(colors())) == 4 and found[3] == HOLE_COLOR, lambda: found)
     set_range(wall, 0.2, 1.1)
-    # Both are beyond the far end now. A picture that is drawn anew, or late, has other colours for a moment.
+    # Both are beyond the far end now. An image that is drawn anew, or late, has other colours for a moment.
     until(lambda: len({*colors()[:3], HOLE_COLOR}) == 3 and found[1:] == [found[1], found[1], HOLE_COLOR], lambda: found)
 
 

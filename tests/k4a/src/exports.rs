@@ -112,7 +112,7 @@ pub unsafe extern "C" fn k4a_device_close(handle: Handle) {
         camera.running = None;
         core::mem::take(&mut camera.troubles.close_hang_ns)
     });
-    world.end(at);
+    world.note_if_held(at);
     drop(world);
     if let Some(ns) = hang.filter(|ns| *ns > 0) {
         sleep_until(now() + ns);
@@ -205,7 +205,7 @@ pub unsafe extern "C" fn k4a_device_start_cameras(
 pub unsafe extern "C" fn k4a_device_stop_cameras(handle: Handle) {
     let mut world = world();
     // The real one waits for its images for good.
-    world.end(handle as usize);
+    world.note_if_held(handle as usize);
     let hang = world.camera(handle as usize).map(|c| {
         c.running = None;
         core::mem::take(&mut c.troubles.stop_hang_ns)

@@ -114,7 +114,7 @@ impl World {
     }
 
     /// Notes a stop or close of a camera while something is held that came from it.
-    pub fn end(&mut self, camera: usize) {
+    pub fn note_if_held(&mut self, camera: usize) {
         let is_held = |thing: &Thing| matches!(thing, Thing::Capture { of, .. } | Thing::Image { of, .. } if *of == camera);
         if self.things.values().any(is_held) {
             self.census.misuse += 1;
