@@ -42,7 +42,7 @@ pub struct CloudArgs {
     /// Dataset, segment file or running rig [default: the only rig running]
     #[arg(value_name = "RIG|DATASET")]
     source: Option<PathBuf>,
-    /// Set of a dataset to show [default: the middle one]
+    /// Set of a dataset to show [default: the middle one, or one near it that lacks less]
     #[arg(long, value_name = "ID")]
     set: Option<u64>,
     /// Depth stream to show [default: depth_refined, else depth, else the first mode]
@@ -138,6 +138,7 @@ pub fn run(args: &CloudArgs, context: &Context) -> Result<Exit> {
     }
     let report = Report {
         set: moment.set,
+        missing: moment.missing.iter().map(ToString::to_string).collect(),
         points: all.points.len(),
         pairs: pairs(&views)?,
         cameras: views.iter().map(View::line).collect(),
@@ -328,6 +329,8 @@ fn pairs(views: &[View]) -> Result<Vec<PairLine>> {
 struct Report {
     /// Number of the set; absent of a running rig.
     set: Option<u64>,
+    /// Streams without an image.
+    missing: Vec<String>,
     points: usize,
     cameras: Vec<CameraLine>,
     pairs: Vec<PairLine>,
@@ -369,8 +372,12 @@ impl Report {
             out::table(&header, 2, rows)
         };
         let set = self.set.map_or_else(|| "now".to_owned(), |id| format!("set {id}"));
+        let missing = match self.missing.as_slice() {
+            [] => String::new(),
+            missing => format!("; no image of {}", missing.join(", ")),
+        };
         format!(
-            "{pairs}\n{set}: {} of {}",
+            "{pairs}\n{set}: {} of {}{missing}",
             out::count(self.points, "point"),
             out::count(self.cameras.len(), "camera")
         )

@@ -6,7 +6,7 @@ use crate::signals::Stop;
 use anyhow::Result;
 use core::time::Duration;
 use depthrig_bus::{RigName, StreamId};
-use depthrig_recorder::{Dataset, DatasetSet, Edge, PixelMode, SetSpan};
+use depthrig_recorder::{Dataset, DatasetSet, Edge, PixelMode, SetReader, SetSpan};
 
 /// The images of all cameras at one moment.
 pub(super) struct Moment {
@@ -18,14 +18,19 @@ pub(super) struct Moment {
     pub(super) cameras: Vec<String>,
     /// The images.
     pub(super) shots: Vec<Shot>,
+    /// Streams without an image.
+    pub(super) missing: Vec<StreamId>,
 }
+
+/// Sets before and after the middle one among which one without a gap is looked for: ten seconds at 5 Hz.
+const NEAR: usize = 50;
 
 /// Rounds of a live rig that a stream which has delivered nothing yet is waited for.
 const PATIENCE: usize = 20;
 const ROUND: Duration = Duration::from_millis(150);
 
 impl Moment {
-    /// A set of a dataset; without a number the middle one.
+    /// A set of a dataset; without a number the middle one, or one near it that lacks less.
     pub(super) fn recorded(dataset: &Dataset, id: Option<u64>) -> Result<Self> {
         let set = set(dataset, id)?;
         let shots: Result<Vec<Shot>> = set
@@ -33,12 +38,15 @@ impl Moment {
             .iter()
             .map(|frame| Ok(Shot { header: frame.header, pixels: frame.decoded()? }))
             .collect();
-        let cameras = dataset.session().streams.iter().map(|s| s.id.camera.to_string());
+        let streams = &dataset.session().streams;
+        let cameras = streams.iter().map(|s| s.id.camera.to_string());
+        let missing = set.missing.iter().filter_map(|stream| streams.get(*stream));
         Ok(Self {
             name: format!("set {} of {}", set.id, dataset.path().display()),
             set: Some(set.id),
             cameras: in_order(cameras),
             shots: shots?,
+            missing: missing.map(|s| s.id.clone()).collect(),
         })
     }
 
@@ -59,10 +67,12 @@ impl Moment {
                 break;
             }
         }
+        let missing = ids.iter().zip(&newest).filter(|(_, shot)| shot.is_none());
         Ok(Some(Self {
             name: format!("rig {rig}"),
             set: None,
             cameras: in_order(ids.iter().map(|id| id.camera.to_string())),
+            missing: missing.map(|(id, _)| id.clone()).collect(),
             shots: newest.into_iter().flatten().collect(),
         }))
     }
@@ -84,7 +94,25 @@ fn set(dataset: &Dataset, id: Option<u64>) -> Result<DatasetSet> {
         Some(id) => {
             SetSpan { from: Some(Edge::Set(id)), to: Some(Edge::Set(id)) }.numbers(&mut reader)?.start
         }
-        None => reader.times().len() / 2,
+        None => fullest_near_middle(&mut reader),
     };
     Ok(reader.read(number, PixelMode::Stored)?)
+}
+
+/// The set in which the fewest streams are missing, the nearest to the middle of those. A set that cannot be read counts as the emptiest.
+fn fullest_near_middle(reader: &mut SetReader) -> usize {
+    let count = reader.times().len();
+    let middle = count / 2;
+    let mut best = (usize::MAX, middle);
+    let near = (0..=NEAR).flat_map(|distance| [middle.checked_add(distance), middle.checked_sub(distance)]);
+    for number in near.flatten().filter(|number| *number < count) {
+        let missing = reader.read(number, PixelMode::None).map_or(usize::MAX, |set| set.missing.len());
+        if missing < best.0 {
+            best = (missing, number);
+        }
+        if missing == 0 {
+            break;
+        }
+    }
+    best.1
 }
