@@ -147,7 +147,8 @@ fn files_at_their_end_are_taken_to_the_last_frame() {
             assert!(running.send_copy(0, &ExternalFrame::default(), &[1; 32 * 24 * 3]).unwrap());
         }
         let finished = std::thread::scope(|s| {
-            let ending = s.spawn(|| running.finish("that was all", Duration::from_millis(900)));
+            let timeout = if confirmed { WAIT } else { Duration::from_secs(2) };
+            let ending = s.spawn(move || running.finish("that was all", timeout));
             let said = hear(&link, |b| b.state == Some(ExternalState::Refused) && b.session == session);
             assert_eq!(
                 (said.beat.reason, said.beat.text().as_str()),
@@ -242,7 +243,11 @@ fn both_sides_understand_each_other() {
     assert_eq!((h.format, h.width, h.height, h.payload_len), (PixelFormat::Z16 as u32, 32, 24, 1536));
     assert!(frame.pixels().iter().all(|b| *b == 9) && frame.pixels().len() == 1536);
 
-    // A later session ends this one; an earlier one, such as an abandoned thread's, does not.
+    // A later session ends this one; an earlier one, such as an abandoned thread's, does not. It has heard from its
+    // own just before: silence would end it.
+    link.answer(&run(10, ExternalWant::Run, &[0, 1, 0])).unwrap();
+    let number = hear(&link, |_| true).beat.number;
+    hear(&link, |b| b.number > number + 2);
     link.answer(&run(9, ExternalWant::Stop, &[0, 0, 0])).unwrap();
     std::thread::sleep(Duration::from_millis(300));
     assert!(session.is_wanted());
@@ -269,8 +274,11 @@ fn both_sides_understand_each_other() {
     link.answer(&run(12, ExternalWant::Run, &[1, 0, 0])).unwrap();
     let session = camera.next_session(WAIT).unwrap().unwrap();
     assert!(session.is_wanted());
-    std::thread::sleep(Duration::from_millis(2700));
-    assert!(!session.is_wanted());
+    let deadline = depthrig_bus::HostTime::now().plus(WAIT);
+    while session.is_wanted() {
+        assert!(!deadline.from_now().is_zero());
+        std::thread::sleep(Duration::from_millis(5));
+    }
     drop(session);
 
     let refused = Answer { text: "no such lens", ..run(0, ExternalWant::Refused, &[0]) };

@@ -330,11 +330,12 @@ export class RecordBar {
   async #start(force) {
     const scene = this.#scene.value.trim();
     const operator = this.#operator.value.trim();
-    const body = { scene, operator, notes: this.#notes.value.trim(), ...(force ? { force } : {}) };
+    const typed = this.#notes.value;
+    const body = { scene, operator, notes: typed.trim(), ...(force ? { force } : {}) };
     if (!(await this.#ask("start", "/v1/record/start", body))) {
       return;
     }
-    this.#notes.value = "";
+    this.#clearNotes(typed);
     store(OPERATOR_KEY, operator);
     const scenes = addScene(parseScenes(stored(SCENES_KEY)), scene);
     store(SCENES_KEY, JSON.stringify(scenes));
@@ -362,15 +363,30 @@ export class RecordBar {
   }
 
   async #note() {
-    const text = this.#notes.value.trim();
+    const typed = this.#notes.value;
+    const text = typed.trim();
     if (text === "" || this.#shown !== "recording") {
       return;
     }
     if (await this.noteText(text)) {
-      this.#notes.value = "";
-      this.#notes.blur();
+      if (this.#clearNotes(typed)) {
+        this.#notes.blur();
+      }
       announce("Note added");
     }
+  }
+
+  /**
+   * Clears the notes, unless something else was typed while the daemon answered.
+   *
+   * @param {string} typed what was sent
+   * @returns {boolean} whether they are clear
+   */
+  #clearNotes(typed) {
+    if (this.#notes.value === typed) {
+      this.#notes.value = "";
+    }
+    return this.#notes.value === "";
   }
 
   /**

@@ -553,7 +553,7 @@ fn the_end_does_not_wait_for_slow_clients_or_slow_calls() {
     let begin = HostTime::now();
     served.server.stop();
     let took = begin.elapsed();
-    assert!(took < Duration::from_secs(1), "{took:?}");
+    assert!(took < Duration::from_millis(2500), "{took:?}");
     let mut rest = Vec::new();
     assert_eq!(idle.read_to_end(&mut rest).unwrap_or(0), 0);
 }
@@ -569,7 +569,7 @@ fn a_slow_call_does_not_make_others_wait_and_idle_connections_leave_room() {
     served.fake.wait_for_call();
     let begin = HostTime::now();
     assert_eq!(served.get("/v1/status").status, 200);
-    assert!(begin.elapsed() < Duration::from_secs(1));
+    assert!(begin.elapsed() < Duration::from_millis(1500));
 }
 
 #[test]

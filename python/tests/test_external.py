@@ -260,9 +260,10 @@ def test_a_silent_daemon_ends_the_session_and_a_new_one_begins(camera: ExternalC
     session = _session(camera)
     session.send("color", RED)
     daemon.beating = False
-    began = time.monotonic()
     _until(lambda: not session.wanted)
-    assert time.monotonic() - began > layout.EXTERNAL_SILENCE_S - 0.5, "a pause is no end"
+    # A busy computer may not have heard it for some time before.
+    assert camera._answer is not None
+    assert time.monotonic() - camera._answer.heard > layout.EXTERNAL_SILENCE_S, "a pause is no end"
     session.close()
     assert camera.wait(0.3) is None
     daemon.beating = True

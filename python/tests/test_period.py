@@ -90,17 +90,21 @@ def test_frames_out_of_time_are_read_at_once_and_none_is_lost(
     rest = s._open.rest
     s._open.rest = lambda ns: rests.append(rest(ns)) or rests[-1]  # type: ignore[method-assign, func-returns-value]
 
+    # The channel keeps four frames that are not read.
+    room = threading.Semaphore(4)
+
     def publish() -> None:
-        start = time.monotonic()
-        for due in (*(0.05 * i for i in range(1, 21)), 1.005, 1.3):
-            time.sleep(max(0.0, start + due - time.monotonic()))
+        for after in (*[0.05] * 20, 0.005, 0.295):
+            time.sleep(after)
+            room.acquire(timeout=WAIT_S)
             depth.send(time.monotonic_ns(), publish_time_ns=time.monotonic_ns())
 
-    thread = threading.Thread(target=publish)
+    thread = threading.Thread(target=publish, daemon=True)
     thread.start()
     waits = []
     for sequence in range(1, 23):
         frame = s.next(WAIT_S)
+        room.release()
         waits.append(frame.age_s)
         assert frame.sequence == sequence
         del frame

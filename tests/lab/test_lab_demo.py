@@ -27,8 +27,10 @@ def test_the_demo_of_the_lab_from_scenes_to_a_live_camera(tmp_path: Path) -> Non
         assert f">{row}<" in held_out, row
     (dataset,) = (out / "live").iterdir()
     listed = subprocess.run(
-        [os.environ["DEPTHRIG_BIN"], "info", dataset], capture_output=True, text=True, timeout=60, check=True
+        [os.environ["DEPTHRIG_BIN"], "info", dataset], capture_output=True, text=True, timeout=60, check=False
     )
+    # 3: intact, but a busy computer may lose a frame.
+    assert listed.returncode in (0, 3), listed.stderr
     # On a busy computer refined images may all come too late for their sets; the stream is there all the same.
     assert "d435/depth_refined" in listed.stdout
     assert ">d435 depth<" in (out / "live.html").read_text()

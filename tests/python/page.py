@@ -326,8 +326,8 @@ def blank(browser: Browser, origin: str) -> Iterator[Wall]:
     if "DEPTHRIG_PAGE_DIR" in os.environ:
         serve_from(context, Path(os.environ["DEPTHRIG_PAGE_DIR"]))
     try:
+        context.set_default_timeout(WAIT_MS)
         wall = Wall(context.new_page(), origin)
-        wall.page.set_default_timeout(WAIT_MS)
         yield wall
         wall.check()
     finally:

@@ -108,13 +108,16 @@ class Router:
     def __init__(self, port: int) -> None:
         self.port = port
         self.tokens: set[str] = set()
+        self._lock = threading.Lock()
         self.session = router_session(port)
         watched = self.session.liveliness().declare_subscriber("@ros2_lv/**", self._token, history=True)
         self._watched = watched
 
     def _token(self, sample: zenoh.Sample) -> None:
-        change = self.tokens.add if sample.kind == zenoh.SampleKind.PUT else self.tokens.discard
-        change(str(sample.key_expr))
+        token = {str(sample.key_expr)}
+        # A new set each time: the tests go through the old one meanwhile.
+        with self._lock:
+            self.tokens = self.tokens | token if sample.kind == zenoh.SampleKind.PUT else self.tokens - token
 
     def wait_for(self, *topics: str) -> None:
         """Wait until these topics are announced."""

@@ -111,7 +111,7 @@ def dataset(binary: str, runtime: Path, tmp_path_factory: pytest.TempPathFactory
             reader.wait(timeout=WAIT_S)
         recording = depthrig.Recording("cell", runtime)
         dataset = Path(recording.start()["path"])
-        wait_for_sets(recording, 20)
+        wait_for_sets(recording, 40)
         recording.stop()
     return dataset
 

@@ -180,7 +180,7 @@ def test_frames_carry_the_calibration_of_the_rig(binary: str, runtime: Path, tmp
     rig = tmp_path / "rig.toml"
     rig.write_text(RIG)
     (tmp_path / "calibration.toml").write_text(CALIBRATION.format(serial="", width=640))
-    with running(binary, runtime, tmp_path / "log", "run", str(rig), "--record", str(tmp_path / "out"), "--seconds", "4"):
+    with running(binary, runtime, tmp_path / "log", "run", str(rig)):
         stream = depthrig.Stream("cam/color", runtime_dir=runtime, timeout=WAIT_S)
         frame = stream.next(timeout=WAIT_S)
         assert frame is not None
@@ -241,10 +241,12 @@ reserve_mb = 64
 name = "a"
 backend = "synthetic"
 model = "d435"
+poses = 1
 [[camera]]
 name = "b"
 backend = "synthetic"
 model = "d435"
+poses = 1
 pose = { translation_m = [0.08, 0.0, 0.0] }
 """
 

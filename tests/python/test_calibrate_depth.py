@@ -10,7 +10,8 @@ from pathlib import Path
 import depthrig
 import numpy as np
 from numpy.typing import NDArray
-from test_daemon import WAIT_S, binary, command, running, runtime
+from test_calibrate_time import command
+from test_daemon import WAIT_S, binary, running, runtime
 
 __all__ = ["binary", "runtime"]
 
@@ -65,18 +66,21 @@ def test_the_error_of_depth_is_found_and_corrected(binary: str, runtime: Path, t
     command(binary, runtime, "calibrate", "board", "--paper", "a3", "--name", str(tmp_path / "board"))
     path = tmp_path / "rig.toml"
     path.write_text(CAMERAS.replace("REFINE", ""))
-    # A busy computer may lose sets; the board rests long enough for some of each place.
-    recording = ("run", str(path), "--record", str(tmp_path / "wall"), "--seconds", "26")
-    with running(binary, runtime, tmp_path / "log", *recording) as daemon:
-        daemon.wait(WAIT_S)
-    (dataset,) = (tmp_path / "wall").iterdir()
-    raw = digests(dataset)
     out = tmp_path / "calibration.toml"
     arguments = ("--board", str(tmp_path / "board.toml"), "-o", str(out), "--json")
-    found = json.loads(
-        command(binary, runtime, "calibrate", "depth", str(dataset), *arguments, codes=(0, 3))
-    )
-    streams = {stream["camera"]: stream for stream in found["streams"]}
+    # The board rests long enough for some sets of each place. A very busy computer may lose them all the same.
+    for tries in (2, 1, 0):
+        recording = ("run", str(path), "--record", str(tmp_path / f"wall{tries}"), "--seconds", "26")
+        with running(binary, runtime, tmp_path / "log", *recording) as daemon:
+            daemon.wait(WAIT_S)
+        (dataset,) = (tmp_path / f"wall{tries}").iterdir()
+        raw = digests(dataset)
+        out.unlink(missing_ok=True)
+        said = command(binary, runtime, "calibrate", "depth", str(dataset), *arguments, codes=(0, 1, 3) if tries else (0, 3))
+        found = json.loads(said or '{"streams": [], "left_out": "all"}')
+        streams = {stream["camera"]: stream for stream in found["streams"]}
+        if set(streams) == {"wrong", "right"}:
+            break
     assert set(streams) == {"wrong", "right"}, found["left_out"]
     wrong = streams["wrong"]
     assert wrong["model"] == "scale_offset"
@@ -183,7 +187,9 @@ offset_mm = {-OFFSET_MM / SCALE}
     head = 'format = "depthrig.calibration/1"\ncreated = "2026-11-25T03:00:00Z"\nreference = ""\nrms_px = 0.0\ncamera = []\n'
     calibration = f"{head}\n[board]\n{board}\n{correction}"
     rig = 'calibration = "calibration.toml"\n' + CAMERAS.replace("REFINE", REFINE)
-    (tmp_path / "rig.toml").write_text(rig.replace('motion = "wall", hold_s = 1.5', 'motion = "wall", hold_s = 600.0'))
+    still = rig.replace("hold_s = 2.0", "hold_s = 600.0")
+    assert still != rig
+    (tmp_path / "rig.toml").write_text(still)
     (tmp_path / "calibration.toml").write_text(calibration.replace("width = 1280", "width = 1288"))
     with running(binary, runtime, tmp_path / "log", "run", str(tmp_path / "rig.toml"), codes=(1, 2, 3)) as daemon:
         daemon.wait(WAIT_S)

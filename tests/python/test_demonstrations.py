@@ -160,7 +160,7 @@ def recovered(binary: str, runtime: Path, tmp_path_factory: pytest.TempPathFacto
         dataset = Path(recording.start(scene="table")["path"])
         for number in range(1, 5):
             with recording.episode(f"task {number % 2}"):
-                wait_for_sets(recording, 6)
+                wait_for_sets(recording, 10)
             recording.mark_episode("failure" if number == 2 else "success")
             if number == 3:
                 recording.discard_episode()
@@ -409,15 +409,16 @@ def test_a_gap_is_named_and_refused_or_masked(binary: str, runtime: Path, tmp_pa
                 reader.wait(timeout=WAIT_S)
             dataset = Path(recording.start()["path"])
             wait_for_sets(recording, 4)
-        wait_for_sets(recording, 4)
+        wait_for_sets(recording, 15)
         with arm(binary, runtime):
             wait_for_sets(recording, 8)
             recording.stop()
     out = tmp_path / "out"
-    call = [binary, "export", "lerobot", str(dataset), str(out)]
+    # A busy computer's arm is late by less.
+    call = [binary, "export", "lerobot", str(dataset), str(out), "--max-gap", "1s"]
     refused = subprocess.run(call, capture_output=True, text=True, timeout=WAIT_S, check=False)
     assert refused.returncode == 2
-    assert "signal arm/gripper has no samples at most 0.2 s apart" in refused.stderr
+    assert "signal arm/gripper has no samples at most 1 s apart" in refused.stderr
     assert "--gaps mask" in refused.stderr
     assert not out.exists()
     command(binary, runtime, *call[1:], "--gaps", "mask", codes=(0, 3))
@@ -432,7 +433,7 @@ def test_a_gap_is_named_and_refused_or_masked(binary: str, runtime: Path, tmp_pa
     np.testing.assert_allclose(next(iter(held))[1:], values[before][-1], rtol=3e-7)
 
     out = tmp_path / "hdf5"
-    call = [binary, "export", "hdf5", str(dataset), str(out)]
+    call = [binary, "export", "hdf5", str(dataset), str(out), "--max-gap", "1s"]
     refused = subprocess.run(call, capture_output=True, text=True, timeout=WAIT_S, check=False)
     assert refused.returncode == 2 and "--gaps mask" in refused.stderr and not out.exists()
     command(binary, runtime, *call[1:], "--gaps", "mask", codes=(0, 3))

@@ -82,7 +82,7 @@ def test_demonstrations_survive_a_kill_and_become_episodes_of_lerobot(
         assert episode(binary, runtime, "discard")["discarded"]
 
         episode(binary, runtime, "start", "--task", "another")
-        wait_for_sets(binary, runtime, 2)
+        wait_for_sets(binary, runtime, 4)
         episode(binary, runtime, "stop")
         third = episode(binary, runtime, "mark", "failure")
         assert (third["number"], third["outcome"]) == (3, "failure")
@@ -90,7 +90,7 @@ def test_demonstrations_survive_a_kill_and_become_episodes_of_lerobot(
         assert "2 episodes, 1 discarded" in shown
 
         episode(binary, runtime, "start", "--task", "killed in it")
-        wait_for_sets(binary, runtime, 6)
+        wait_for_sets(binary, runtime, 12)
         daemon.kill()
         daemon.wait(WAIT_S)
 

@@ -76,10 +76,14 @@ def golden(binary: str, tmp_path_factory: pytest.TempPathFactory) -> Golden:  # 
 
 @pytest.fixture(scope="module")
 def recorded(binary: str, runtime: Path, rig_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: F811
-    """Two seconds of the real images, colour without loss."""
+    """Four seconds of the real images, colour without loss."""
     folder = tmp_path_factory.mktemp("real")
-    command = [binary, "run", str(rig_file), "--record", str(folder), "--seconds", "2"]
-    subprocess.run(command, env=environment(runtime), check=True, timeout=WAIT_S, capture_output=True)
+    command = [binary, "run", str(rig_file), "--record", str(folder), "--seconds", "4"]
+    done = subprocess.run(
+        command, env=environment(runtime), timeout=WAIT_S, capture_output=True, text=True, check=False
+    )
+    # 3: intact, but a busy computer may lose a frame.
+    assert done.returncode in (0, 3), done.stdout + done.stderr
     (session,) = folder.rglob("session.toml")
     return session.parent
 

@@ -15,7 +15,7 @@ import threading
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -124,8 +124,9 @@ def killing(program: str, seed: int) -> Iterator[list[int]]:
         while len(killed) < KILLS and not done.wait(0.02 + 0.1 * chance.random()):
             if there := [p for p in children(program) if p not in killed]:
                 pid = chance.choice(there)
-                os.kill(pid, 9)
-                killed.append(pid)
+                with suppress(ProcessLookupError):  # it has ended
+                    os.kill(pid, 9)
+                    killed.append(pid)
 
     thread = threading.Thread(target=kill)
     thread.start()
@@ -142,10 +143,13 @@ def test_killed_workers_lose_and_double_nothing(
 ) -> None:
     command = SCENES if what == "scenes" else ["cdm", "relabel", str(data), "--engine", "fill", "-j", "1"]
     assert code(binary, *command, "--out", str(tmp_path / "calm"), "--shard", "0/1")[0] == 0
-    out = tmp_path / "disturbed"
-    with killing(binary, seed=3) as killed:
-        # Every kill may hit the same part.
-        ray.run_local([binary, *command, "--out", str(out)], n=3, jobs=2, retries=KILLS)
+    # A busy computer may start to kill when the work is over.
+    for out in (tmp_path / f"disturbed_{i}" for i in range(5)):
+        with killing(binary, seed=3) as killed:
+            # Every kill may hit the same part.
+            ray.run_local([binary, *command, "--out", str(out)], n=3, jobs=2, retries=KILLS)
+        if killed:
+            break
     assert killed, "the work was over before a worker was killed"
     assert files(out) == files(tmp_path / "calm")
 
@@ -166,9 +170,10 @@ ray.run_local([sys.executable, "-c", "import os, pathlib, time; "
     worker.kill()
     worker.wait(WAIT_S)
     began = time.monotonic()
-    while Path(f"/proc/{pid}").exists() and "zombie" not in Path(f"/proc/{pid}/status").read_text():
-        assert time.monotonic() - began < WAIT_S, "the command outlives its worker"
-        time.sleep(0.02)
+    with suppress(OSError):  # it has ended
+        while "zombie" not in Path(f"/proc/{pid}/status").read_text():
+            assert time.monotonic() - began < WAIT_S, "the command outlives its worker"
+            time.sleep(0.02)
 
 
 @contextmanager
@@ -488,7 +493,7 @@ def test_the_parts_make_what_one_run_makes(binary: str, data: Path, tmp_path: Pa
     assert ended == 0, why
     assert one["pieces"] >= 3
     assert one["pieces_found"] == one["pieces_missing"] == one["lost"] == 0
-    assert one["frames"] == one["sets"] == one["streams"][0]["frames"]
+    assert one["frames"] == one["streams"][0]["frames"] == one["sets"] - one["streams"][0]["unpaired"] > 0
     assert one["frames_per_core_second"] > 0
     parts = [relabel(binary, data, tmp_path / "three", "-j", "1", part=f"{k}/3") for k in range(3)]
     assert [p[0] for p in parts] == [0, 0, 0]
@@ -580,7 +585,7 @@ def test_tiny_refines_segments_too(binary: str, data: Path, tmp_path: Path) -> N
     report = json.loads(said)
     (stream,) = report["streams"]
     assert stream["engine"].startswith("tiny onnxruntime")
-    assert stream["frames"] == report["sets"] > 0
+    assert stream["frames"] == report["sets"] - stream["unpaired"] > 0
     # Whatever is made at once.
     ended, _, why = code(binary, *arguments, str(tmp_path / "one"), "-j", "1")
     assert ended == 0, why
@@ -606,7 +611,8 @@ def test_sets_of_discarded_episodes_are_refined_too(binary: str, data: Path, tmp
         session.write(f"\n[[episodes]]\nnumber = 1\nstart_utc_ns = 0\nend_utc_ns = {1 << 62}\ndiscarded = true\n")
     ended, report, why = relabel(binary, source, tmp_path / "out")
     assert ended == 0, why
-    assert report["streams"][0]["frames"] == report["sets"] > 0
+    (stream,) = report["streams"]
+    assert stream["frames"] == report["sets"] - stream["unpaired"] > 0
     ended, _, why = code(binary, "cdm", "relabel", str(source), str(tmp_path / "copy"), "--engine", "fill")
     assert ended == 0, why
 
@@ -619,9 +625,10 @@ def test_what_cannot_be_refined_is_skipped_and_named(
     folder.mkdir()
     for name in ("good", "torn", "empty"):
         subprocess.run(["cp", "-r", str(dataset), str(folder / name)], check=True)
+    # A busy computer may record few sets in a segment.
+    cut = max(sorted(dataset.glob("seg_*.mcap"))[1:-1], key=lambda segment: segment.stat().st_size)
     for name, keep in (("torn", 2), ("empty", 1000)):
-        segment = folder / name / "seg_0001.mcap"
-        os.truncate(segment, segment.stat().st_size // keep)
+        os.truncate(folder / name / cut.name, cut.stat().st_size // keep)
     (folder / "odd").mkdir()
     (folder / "odd" / "session.toml").write_text("streams = 7")
     (folder / "notes").mkdir()
@@ -651,7 +658,7 @@ def test_what_cannot_be_refined_is_skipped_and_named(
     assert all(f"skipped: {name}" in why for name in skipped)
     # Of half a segment what is there is refined, and the loss is stated, by the next run too.
     assert report["lost"] > 0
-    assert any("seg_0001.mcap" in p for p in report["problems"]), report["problems"]
+    assert any(cut.name in p for p in report["problems"]), report["problems"]
     (folder / "live").unlink()
     ended, again, _ = relabel(binary, folder, tmp_path / "out")
     assert (ended, again["lost"], again["frames"]) == (3, report["lost"], 0)

@@ -207,12 +207,14 @@ def test_raw_depth_is_left_of_the_line_and_refined_depth_right(wall: Wall) -> No
         return [max(abs(x - y) for x, y in zip(*pair)) > GREY for pair in zip(a, b)]
 
     def settled() -> list[tuple[int, int, int]]:
-        """The colours, as soon as two looks agree."""
+        """The colours, as soon as two looks agree. An image that is late is grey."""
+        tile = f'section.tile[data-stream="{RAW}"]'
         colors: list[list[tuple[int, int, int]]] = [[], wall.colors(RAW, *patches)]
 
         def is_settled() -> bool:
+            was_live = wall.state(tile) == "live"
             colors[:] = [colors[1], wall.colors(RAW, *patches)]
-            return colors[0] == colors[1]
+            return was_live and colors[0] == colors[1] and wall.state(tile) == "live"
 
         until(is_settled, lambda: colors)
         return colors[1]

@@ -27,7 +27,7 @@ from page import (
 )
 from playwright.sync_api import Browser, Route, WebSocketRoute
 from test_daemon import WAIT_S, binary, running, runtime
-from test_page import CODES, browser, millimetres, near
+from test_page import CODES, browser, millimetres, wait_for_colors
 
 __all__ = ["binary", "browser", "runtime"]
 
@@ -52,8 +52,7 @@ def rig(binary: str, runtime: Path, tmp_path_factory: pytest.TempPathFactory) ->
 def test_a_large_camera_is_seen_to_the_millimetre(browser: Browser, rig: Address) -> None:
     with opened(browser, rig) as wall:
         wall.wait_for_image("large/color", "large/depth")
-        for patch, color in zip((NEAR, FAR, MIDDLE), wall.colors("large/color", NEAR, FAR, MIDDLE)):
-            assert near(color, patch.color)
+        wait_for_colors(wall, "large/color", NEAR, FAR, MIDDLE)
         # Enlarged it has as many pixels as the window, and the pointer still shows the full image.
         wall.tile("large/depth").click()
         wall.wait_for_image("large/depth")

@@ -122,7 +122,7 @@ class Recorded:
 
 def is_heard(binary: str, runtime: Path, signal: str) -> bool:
     """Whether the daemon has read a sample: it looks for new signals five times a second, and records what comes from then on."""
-    status = json.loads(command(binary, runtime, "status", "--json"))
+    status = json.loads(command(binary, runtime, "status", "--json", codes=(0, 3)))
     return signal in {s["signal"] for s in status["signals"]}
 
 
@@ -154,11 +154,11 @@ def recorded(binary: str, runtime: Path, rig: Path) -> Recorded:
                 early = running_loop.run(policy, steps=1).no_sample
                 before += 1
             command(binary, runtime, "record", "start", "--name", "policy")
-            path = json.loads(command(binary, runtime, "status", "--json"))["recording"]["path"]
+            path = json.loads(command(binary, runtime, "status", "--json", codes=(0, 3)))["recording"]["path"]
             done.dataset = Path(path)
             done.sent.clear()
             report = running_loop.run(policy, steps=30)
-            wait_for_sets(binary, runtime, 12)
+            wait_for_sets(binary, runtime, 30)
             command(binary, runtime, "record", "stop", codes=(0, 3))
     assert (report.observations, report.actions, report.stale) == (before + 30, before + 30, 0)
     assert report.no_sample == early

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import subprocess
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rerun.chunk import McapReader
 from rosbags.highlevel import AnyReader
-from test_daemon import CAMERAS, ROOT, WAIT_S, binary, environment, rig_file, runtime  # noqa: F401
+from test_daemon import CAMERAS, ROOT, WAIT_S, binary, command, rig_file, running, runtime, wait_until_answers  # noqa: F401
 
 TYPES = {"rgb8": np.dtype("u1"), "16UC1": np.dtype("<u2")}
 SOURCES = {
@@ -29,9 +30,15 @@ SOURCES = {
 @pytest.fixture(scope="module")
 def segments(binary: str, runtime: Path, rig_file: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:  # noqa: F811
     folder = tmp_path_factory.mktemp("outside")
-    command = [binary, "run", str(rig_file), "--record", str(folder), "--seconds", "3"]
-    done = subprocess.run(command, env=environment(runtime), capture_output=True, text=True, timeout=WAIT_S, check=False)
-    assert done.returncode == 0, done.stderr
+    with running(binary, runtime, folder / "log", "run", str(rig_file), "--record", str(folder)):
+        wait_until_answers(runtime, "images")
+        deadline = time.monotonic() + WAIT_S
+        sets = 0
+        while sets < 15:
+            assert time.monotonic() < deadline, f"{sets} sets"
+            time.sleep(0.1)
+            recording = json.loads(command(binary, runtime, "status", "--json", codes=(0, 3)))["recording"]
+            sets = recording["sets"] if recording else 0
     found = sorted(folder.rglob("seg_*.mcap"))
     assert found
     return found
@@ -111,7 +118,7 @@ def test_node(segments: list[Path], tmp_path: Path) -> None:
         )
     index = {"sets": len(sets), "first_set": sets[0], "images": images, "motion": []}
     (tmp_path / "index.json").write_text(json.dumps(index))
-    command = ["node", "check_node.mjs", str(segments[0].parent), str(tmp_path)]
-    done = subprocess.run(command, cwd=ROOT / "tests" / "readers", capture_output=True, text=True, check=False)
+    program = ["node", "check_node.mjs", str(segments[0].parent), str(tmp_path)]
+    done = subprocess.run(program, cwd=ROOT / "tests" / "readers", capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("images agree") == 2, done.stdout

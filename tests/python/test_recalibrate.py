@@ -143,6 +143,9 @@ def test_a_dataset_speaks_of_the_new_calibration_everywhere(
     before = messages(dataset)
     pixels = images(dataset)
     session = tomllib.loads((dataset / "session.toml").read_text())
+    verify = ("verify", str(dataset), "--decode", "--json")
+    # A busy computer may have lost frames before.
+    findings = json.loads(command(binary, runtime, *verify, codes=(0, 3)))["findings"]
     file = calibration(dataset, tmp_path / "calibration.toml")
     edited = json.loads(command(binary, runtime, "edit", str(dataset), "--calibration", str(file), "--json"))
     after = messages(dataset)
@@ -177,7 +180,7 @@ def test_a_dataset_speaks_of_the_new_calibration_everywhere(
     assert images(dataset) == pixels
     stamps = [[(m.header.stamp.sec, m.header.stamp.nanosec) for m in all_["/two/b/color/camera_info"]] for all_ in (before, after)]
     assert stamps[0] == stamps[1]
-    assert json.loads(command(binary, runtime, "verify", str(dataset), "--decode", "--json", codes=(0, 3)))["findings"] == []
+    assert json.loads(command(binary, runtime, *verify, codes=(0, 3)))["findings"] == findings
     # The history has what was before.
     now = tomllib.loads((dataset / "session.toml").read_text())
     assert now["calibration"] == file.read_text()

@@ -194,14 +194,14 @@ def test_compressed_images_are_those_of_the_bus(node: Bridge, router: Router, ru
         router.hear(f"{TOP}/color/image_raw/compressed", COMPRESSED) as jpeg,
         router.hear(f"{TOP}/depth/image_raw/compressedDepth", COMPRESSED) as png,
     ):
-        of_colour = by_stamp(jpeg.wait(4)[1:])
+        of_colour = by_stamp(jpeg.wait(8)[1:])
         for stamp, seen in color.frames_of(list(of_colour)).items():
             message = of_colour[stamp]
             assert message.format == "rgb8; jpeg compressed bgr8"
             pixels = np.asarray(Image.open(io.BytesIO(message.data)))
             off = np.abs(pixels.astype(int) - seen.array)
             assert off.mean() < 2
-        of_depth = by_stamp(png.wait(4)[1:])
+        of_depth = by_stamp(png.wait(8)[1:])
         for stamp, seen in depth.frames_of(list(of_depth)).items():
             message = of_depth[stamp]
             assert message.format == "16UC1; compressedDepth png"
@@ -216,8 +216,8 @@ def test_points_are_the_geometry_of_depth_and_camera_info(node: Bridge, router: 
         router.hear(f"{TOP}/depth/camera_info", CAMERA_INFO) as info,
         router.hear(f"{TOP}/depth/points", POINTS) as cloud,
     ):
-        cloud.wait(4)
-        images = {stamp_ns(m): m for m in raw.messages()}
+        until(lambda: len(by_stamp(raw.messages()).keys() & by_stamp(cloud.messages())) >= 2, "points of images that came")
+        images = by_stamp(raw.messages())
         lens = info.wait(1)[0]
         compared = 0
         for message in cloud.messages():
@@ -314,17 +314,20 @@ def test_every_sample_of_an_imu_is_sent(node: Bridge, router: Router, runtime: P
     topic = f"{TOP}/imu/data_raw"
     late_before = node.status()["topics"][topic]["missed"]
     with Bus(runtime, "top/imu", "cell") as bus, router.hear(topic, IMU) as heard:
-        messages = heard.wait(300)
-        stamps = np.array([stamp_ns(m) for m in messages])
-        offset = utc_offset_ns()
-        until(lambda: max(list(bus.frames)) + offset > stamps[-1], "the bus's samples of that time")
-        batches = [seen.array for _, seen in sorted(bus.frames.items())]
-    samples = np.concatenate(batches)
-    nearest = np.abs(samples["time_ns"][None] + offset - stamps[:, None]).argmin(axis=1)
-    is_there = np.abs(samples["time_ns"][nearest] + offset - stamps) < 2_000_000
-    # Samples that the test's own reader was late for have nothing to be compared with.
-    absent = (~is_there & (stamps > samples["time_ns"][0] + offset)).sum()
-    assert is_there.sum() > 200 and absent <= bus.missed * max(map(len, batches)), (absent, is_there.sum(), bus.missed)
+        messages: list[Any] = []
+        is_there = np.zeros(0, bool)
+        while is_there.sum() <= 200:
+            messages = heard.wait(len(messages) + 300)
+            stamps = np.array([stamp_ns(m) for m in messages])
+            offset = utc_offset_ns()
+            until(lambda: max(list(bus.frames)) + offset > stamps[-1], "the bus's samples of that time")  # noqa: B023
+            batches = [seen.array for _, seen in sorted(bus.frames.items())]
+            samples = np.concatenate(batches)
+            nearest = np.abs(samples["time_ns"][None] + offset - stamps[:, None]).argmin(axis=1)
+            is_there = np.abs(samples["time_ns"][nearest] + offset - stamps) < 2_000_000
+            # Samples that the test's own reader was late for have nothing to be compared with.
+            absent = (~is_there & (stamps > samples["time_ns"][0] + offset)).sum()
+            assert absent <= bus.missed * max(map(len, batches)), (absent, is_there.sum(), bus.missed)
     # On a busy computer messages are lost on their way, and the program's own reader is late; it counts that.
     lost = int((np.diff(numbers(heard)[: len(messages)]) - 1).sum())
     late = node.status()["topics"][topic]["missed"] - late_before
@@ -348,23 +351,39 @@ def stand_still(node: Bridge, seconds: float = 1.5) -> None:
     time.sleep(seconds)
 
 
+def skipped(node: Bridge, topic: str, heard: Heard) -> tuple[int, int, int]:
+    """A count of the skipped images, the last message before it was made, and the first image after it."""
+    earlier = len(heard.payloads) - 1
+    # The next status may have been made before that message.
+    count = [node.status()["topics"][topic]["skipped"] for _ in range(2)][-1]
+    now_ns = time.time_ns()
+    until(lambda: stamp_ns(decode(IMAGE, heard.payloads[-1])) > now_ns, "a later image")
+    later = len(heard.payloads) - 1
+    heard.wait(later + 3)
+    return count, earlier, later
+
+
 def test_after_a_pause_the_newest_image_comes_and_the_others_are_counted(node: Bridge, router: Router, runtime: Path) -> None:
     topic = f"{TOP}/color/image_raw"
-    before = node.status()["topics"][topic]["skipped"]
     with Bus(runtime, "top/color", "cell") as bus, router.hear(topic, IMAGE) as heard:
         heard.wait(3)
+        before, before_from, before_to = skipped(node, topic, heard)
         stand_still(node)
         newest = max(seen.header.sequence for seen in list(bus.frames.values()))
         node.process.send_signal(signal.SIGCONT)
-        messages = heard.wait(len(heard.payloads) + 8)
-        lost = int((np.diff(numbers(heard)[: len(messages)]) - 1).sum())
-        frames = [seen.header.sequence for seen in bus.frames_of([stamp_ns(m) for m in messages]).values()]
-    steps = np.diff(frames)
-    after = int(steps.argmax()) + 1
-    assert steps.max() > 10 and frames[after] >= newest, (frames, newest)
-    skipped = node.wait(lambda s: not s["topics"][topic]["subscribed"], "not subscribed any more")["topics"][topic]["skipped"]
-    # Since the last message a few more may have been.
-    assert 0 <= skipped - before - (int((steps - 1).sum()) - lost) <= 2, (frames, lost, skipped - before)
+        heard.wait(len(heard.payloads) + 8)
+        after, after_from, after_to = skipped(node, topic, heard)
+        stamps = [stamp_ns(message) for message in heard.messages()]
+        seen = bus.frames_of(stamps)
+    frames = {i: seen[stamp].header.sequence for i, stamp in enumerate(stamps) if stamp in seen}
+    sequences = np.array(list(frames.values()))
+    steps = np.diff(sequences)
+    assert steps.max() > 10 and sequences[steps.argmax() + 1] >= newest, (frames, newest)
+    # A message that is lost on its way has a number, too: what is left are images that were not sent, which grow with each message.
+    absent = {i: sequence - int(numbers(heard)[i]) for i, sequence in frames.items()}
+    least = max(absent[i] for i in frames if i <= after_from) - min(absent[i] for i in frames if i >= before_to)
+    most = min(absent[i] for i in frames if i >= after_to) - max(absent[i] for i in frames if i <= before_from)
+    assert least <= after - before <= most, (least, after - before, most, frames)
 
 
 def counted(node: Bridge, topic: str, heard: Heard, bus: Bus) -> tuple[int, int, int]:
@@ -394,19 +413,29 @@ def test_after_a_pause_every_sample_comes_that_the_channel_kept_and_the_others_a
         heard.wait(200)
         first, first_number, before = counted(node, topic, heard, bus)
         stand_still(node)
-        kept = [seen.array for _, seen in sorted(bus.frames.items())][-3:]
-        count, resumed_ns = len(heard.payloads), time.monotonic_ns()
         node.process.send_signal(signal.SIGCONT)
-        heard.wait(count + 400)
+        heard.wait(len(heard.payloads) + 400)
         last, last_number, after = counted(node, topic, heard, bus)
     stamps = np.array([stamp_ns(message) for message in heard.messages()])
-    lost = int((np.diff(numbers(heard)[first : last + 1]) - 1).sum())
+    sent_as = numbers(heard)
+    lost = int((np.diff(sent_as[first : last + 1]) - 1).sum())
     absent = last_number - first_number - (last - first)
     assert after > before and absent == lost + after - before, (absent, lost, before, after)
-    # Of the last ones before it went on none is missing, if it went on at once: the channel keeps a batch for a while only.
-    if lost == 0 and heard.times_ns[count] - resumed_ns < 100_000_000:
-        for time_ns in np.concatenate(kept)["time_ns"] + utc_offset_ns():
-            assert np.abs(stamps - time_ns).min() < STAMP_NS, "a sample that the channel kept"
+    # After each gap the oldest batch comes that the channel kept, which keeps the last four.
+    batches = [seen for _, seen in sorted(bus.frames.items())]
+    times = np.concatenate([batch.array["time_ns"] for batch in batches]) + utc_offset_ns()
+    nearest = np.abs(times[None] - stamps[:, None]).argmin(axis=1)
+    is_seen = np.abs(times[nearest] - stamps) < STAMP_NS
+    batch_of = np.concatenate([np.full(len(batch.array), batch.header.sequence) for batch in batches])[nearest]
+    gaps = [
+        i
+        for i in range(first + 1, last + 1)
+        if is_seen[i - 1] and is_seen[i] and batch_of[i] > batch_of[i - 1] + 1 and sent_as[i] == sent_as[i - 1] + 1
+    ]
+    assert gaps or lost or bus.missed
+    for i in gaps:
+        newest = min(b.header.sequence for b in batches if b.header.publish_time_ns > heard.times_ns[i]) - 1
+        assert batch_of[i] <= newest - 2, (batch_of[i - 1], batch_of[i], newest)
 
 
 def test_diagnostics_have_the_cameras_and_this_program(node: Bridge, router: Router) -> None:
@@ -453,11 +482,20 @@ def test_every_sample_of_a_signal_is_sent(node: Bridge, router: Router, runtime:
                 times[i] = time.monotonic_ns()
                 joints.publish([float(i), 0.5], time_ns=times[i])
                 time.sleep(0.001)
-            until(lambda: states.messages()[-1].velocity[0] == 300, "the last")
-            messages = [m for m in states.messages() if m.velocity[0] > 0]
-            assert [m.velocity[0] for m in messages] == list(range(1, 301))
+
+            def passed() -> bool:
+                joints.publish([301.0, 0.5])
+                return decode(JOINTS, states.payloads[-1]).velocity[0] > 300
+
+            until(passed, "all")
+            messages = states.messages()
+            values = np.array([m.velocity[0] for m in messages]).clip(0)
+            # A message that is lost on its way has a number: the numbers of those that came are as far apart as their samples.
+            assert (np.diff(numbers(states)[: len(messages)]) >= np.diff(values)).all(), values
+            counted_up = [(int(v), m) for v, m in zip(values, messages, strict=True) if 0 < v <= 300]
+            assert counted_up and (np.diff([i for i, _ in counted_up]) > 0).all(), values
             offset = utc_offset_ns()
-            for i, message in enumerate(messages, 1):
+            for i, message in counted_up:
                 assert (list(message.name), list(message.position)) == (["a", "b"], [])
                 assert abs(stamp_ns(message) - offset - times[i]) < 2_000_000
             pose = poses.messages()[-1]
@@ -487,13 +525,15 @@ def test_samples_of_a_signal_that_were_replaced_before_they_were_read_are_counte
         while publish() < 3000:
             pass
         node.process.send_signal(signal.SIGCONT)
-        until(lambda: decode(JOINTS, heard.payloads[-1]).position[0] == 3000, "the last")
-        values = np.array([message.position[0] for message in heard.messages()])
-        lost = int((np.diff(numbers(heard)) - 1).sum())
+        # The last one of these may be lost on its way.
+        until(lambda: publish() and decode(JOINTS, heard.payloads[-1]).position[0] >= 3000, "a sample after them")
+        node.status()
         missed = node.wait(lambda s: s["topics"][topic]["missed"], "samples are missed")["topics"][topic]["missed"]
+        values = np.array([message.position[0] for message in heard.messages()])
+        lost = int((np.diff(numbers(heard)[: len(values)]) - 1).sum())
     # The channel keeps 512.
     assert len(values) + lost >= 512 and np.all(np.diff(values) > 0)
-    assert len(values) + lost + missed == 3000 - values[0] + 1, (len(values), lost, missed, values[0])
+    assert len(values) + lost + missed == values[-1] - values[0] + 1, (len(values), lost, missed, values[[0, -1]])
 
 
 def joint_state(names: list[str], values: list[float], utc_ns: int, velocity: tuple[float, ...] = ()) -> bytes:
@@ -755,7 +795,8 @@ def test_a_daemon_that_is_killed_comes_back_and_a_killed_bridge_disturbs_nobody(
                 started.process.wait()
                 for _ in range(15):
                     after = stream.next(WAIT_S)
-                assert (after.sequence, stream.missed, stream.restarts) == (before + 15, 0, 0)
+                # A busy computer's own reader here may come too late.
+                assert (after.sequence, stream.restarts) == (before + 15 + stream.missed, 0)
                 assert after.header.drops["no_slot"] == 0
                 until(lambda: not any("/depthrig_second/" in t for t in router.tokens), "its tokens go")
             assert daemon.poll() is None

@@ -90,4 +90,4 @@ def test_an_option_runs_the_program_that_path_has(
     monkeypatch.setenv("PATH", f"{program.parent}:{os.environ['PATH']}")
     with rig(binary, runtime, tmp_path, None):
         until(lambda: said.exists() and said.read_text() == "--rig bench.", "the program")
-        assert status(binary, runtime)["pid"]
+        until(lambda: status(binary, runtime)["pid"], "its process")

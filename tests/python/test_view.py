@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from page import HEIGHT, PATCHES, RIG, SIMULATED, WIDTH, files_camera, free_port, pattern
+from page import HEIGHT, PATCHES, RIG, SIMULATED, WIDTH, files_camera, free_port, pattern, until
 from rerun.chunk import RrdReader
 from test_daemon import ROOT, WAIT_S, binary, command, environment, running, runtime
 
@@ -37,11 +40,13 @@ def rig(binary: str, runtime: Path, tmp_path_factory: pytest.TempPathFactory) ->
     text = RIG.format(name="seen", port=free_port()) + files_camera("still", manifest) + turned
     (folder / "rig.toml").write_text(text + SIMULATED.format(name="front"))
     with running(binary, runtime, folder / "log", "run", str(folder / "rig.toml"), "-q"):
-        until = time.monotonic() + WAIT_S
-        while command(binary, runtime, "status", "--json", "--rig", "seen", codes=(0, 1, 3)).count('"streaming"') < 3:
-            assert time.monotonic() < until
-            time.sleep(0.1)
+        wait_until_streaming(binary, runtime, "seen", 3)
         yield folder
+
+
+def wait_until_streaming(binary: str, runtime: Path, rig: str, cameras: int) -> None:
+    status = lambda: command(binary, runtime, "status", "--json", "--rig", rig, codes=(0, 1, 3))
+    until(lambda: status().count('"streaming"') >= cameras, status)
 
 
 def view(runtime: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -138,14 +143,20 @@ def test_a_running_viewer_gets_the_frames(runtime: Path, rig: Path, tmp_path: Pa
     with (tmp_path / "log").open("wb") as log:
         server = subprocess.Popen([rerun, "--save", str(out), "--port", str(port)], stdout=log, stderr=log)
         try:
-            until = time.monotonic() + WAIT_S
-            while True:
+
+            def has_all() -> bool:
+                """Sends images and looks for all streams. A file that is still written may not be readable."""
                 done = view(runtime, "--connect", f"rerun+http://127.0.0.1:{port}/proxy", "--seconds", "3")
                 assert done.returncode == 0, done.stderr
                 time.sleep(1)
-                if out.exists() and out.stat().st_size > 100_000:
-                    break
-                assert time.monotonic() < until, (tmp_path / "log").read_text()
+                with suppress(RuntimeError):
+                    found = components(out)
+                    buffers = {"depth": "DepthImage:buffer", "color": "Image:buffer"}
+                    wanted = [(f"/seen/{c}/{s}", buffer) for c in ("still", "turned") for s, buffer in buffers.items()]
+                    return all(found.get(entity, {}).get(buffer) for entity, buffer in wanted)
+                return False
+
+            until(has_all, (tmp_path / "log").read_text)
         finally:
             server.terminate()
             server.wait(WAIT_S)
@@ -161,9 +172,14 @@ def test_mistakes_are_named(runtime: Path, rig: Path, tmp_path: Path) -> None:
 
 def test_the_end_of_the_rig_ends_the_view(binary: str, runtime: Path, tmp_path: Path) -> None:
     (tmp_path / "rig.toml").write_text(RIG.format(name="ending", port=free_port()) + SIMULATED.format(name="front"))
-    arguments = ("run", str(tmp_path / "rig.toml"), "-q", "--seconds", "6")
-    with running(binary, runtime, tmp_path / "log", *arguments) as daemon:
-        time.sleep(2)
-        done = view(runtime, "--rig", "ending", "--save", str(tmp_path / "out.rrd"))
+    out = tmp_path / "out.rrd"
+    arguments = ("run", str(tmp_path / "rig.toml"), "-q")
+    with running(binary, runtime, tmp_path / "log", *arguments) as daemon, ThreadPoolExecutor() as pool:
+        wait_until_streaming(binary, runtime, "ending", 1)
+        viewing = pool.submit(view, runtime, "--rig", "ending", "--save", str(out))
+        # It shows images.
+        until(lambda: viewing.done() or (out.exists() and out.stat().st_size > 100_000))
+        daemon.send_signal(signal.SIGINT)
+        done = viewing.result()
         assert done.returncode == 0 and "rig ending has ended" in done.stderr, done.stderr
         daemon.wait(WAIT_S)

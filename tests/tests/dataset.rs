@@ -8,7 +8,7 @@ use depthrig_daemon::replay::{Replay, ReplayOptions};
 use depthrig_recorder::fs::{Fs, RealFs};
 use depthrig_recorder::{Dataset, DatasetSet, SetRange};
 use depthrig_tests::fixture::Fixture;
-use depthrig_tests::{Home, RigText, all_stream, assert_balanced, wait_until};
+use depthrig_tests::{Home, RigText, all_stream, assert_balanced, assert_undisturbed, wait_until};
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -102,7 +102,10 @@ fn live_recorded_and_replayed_frames_are_the_same() {
     });
     let summary = rig.stop();
     assert_balanced(&summary.status);
-    assert_eq!(summary.lost, Vec::<String>::new());
+    summary.status.cameras.iter().for_each(assert_undisturbed);
+    // A busy computer may have no time for a set.
+    assert!(recorded.dropped.keys().all(|reason| reason == "encoder_busy"), "{recorded:?}");
+    assert!(recorded.error.is_none() || !recorded.dropped.is_empty(), "{recorded:?}");
 
     let dataset = Dataset::open(recorded.path.as_ref()).unwrap();
     assert_eq!(dataset.session().scene, "desk");
@@ -129,7 +132,7 @@ fn live_recorded_and_replayed_frames_are_the_same() {
     }
     // A busy computer may be late with a frame.
     let complete = sets.iter().filter(|s| s.missing.is_empty()).count();
-    assert!(4 * complete >= 3 * sets.len(), "{complete} of {} sets are complete", sets.len());
+    assert!(2 * complete >= sets.len(), "{complete} of {} sets are complete", sets.len());
     // The test's own subscriber may be late on a busy computer, too. What it did not see, it must have counted.
     assert!(unseen <= missed && in_dataset.len() as u64 >= 2 * unseen, "{unseen} unseen, {missed} missed");
     replayed_is(&home, recorded.path.as_ref(), &in_dataset);
@@ -175,7 +178,7 @@ fn a_camera_that_is_lost_leaves_marked_sets() {
     let text = RigText::default()
         .camera("left", "")
         .camera("right", "")
-        .fault("unplug", 1.0, "duration_s = 1.0")
+        .fault("unplug", 3.0, "duration_s = 1.0")
         .text()
         .to_owned()
         + RAW;
@@ -191,18 +194,22 @@ fn a_camera_that_is_lost_leaves_marked_sets() {
     rig.stop();
     let dataset = Dataset::open(recorded.path.as_ref()).unwrap();
     let sets: Vec<_> = dataset.sets(SetRange::ALL).map(Result::unwrap).collect();
-    let missing = sets.iter().filter(|s| !s.missing.is_empty()).count();
+    let of =
+        |set: &DatasetSet, camera: &str| set.frames.iter().filter(|f| f.header.camera() == camera).count();
+    let (alone, others): (Vec<_>, Vec<_>) = sets.iter().partition(|s| of(s, "right") == 0);
     assert!(
-        (2..=12).contains(&missing),
-        "one second without a camera and its return are five to ten sets, not {missing}"
+        (2..=12).contains(&alone.len()),
+        "one second without a camera and its return are five to ten sets, not {}",
+        alone.len()
     );
     for set in &sets {
         assert_eq!(set.frames.len() + set.missing.len(), 4);
     }
     // A busy computer may be late with a frame of either.
-    let with_left = |s: &&DatasetSet| s.frames.iter().filter(|f| f.header.camera() == "left").count() == 2;
-    let left = sets.iter().filter(with_left).count();
-    assert!(4 * left >= 3 * sets.len(), "left was always there, and is in {left} of {} sets", sets.len());
+    for sets in [alone, others] {
+        let left = sets.iter().filter(|s| of(s, "left") == 2).count();
+        assert!(2 * left >= sets.len(), "left was always there, and is in {left} of {} sets", sets.len());
+    }
 }
 
 #[test]

@@ -103,6 +103,11 @@ fn pid(status: &RigStatus) -> u32 {
     ext(status).port.strip_prefix("process ").unwrap().parse().unwrap()
 }
 
+/// A rig that leaves what it says of a lost camera in its status for long enough to be read.
+fn patient(text: &str) -> String {
+    text.replace("backoff_max_s = 0.5", "backoff_min_s = 2.0\nbackoff_max_s = 2.0")
+}
+
 /// Ends the rig; the camera beside must have lost nothing.
 fn stop(rig: Rig) -> RigStatus {
     let status = rig.stop().status;
@@ -142,7 +147,7 @@ fn a_process_may_start_before_or_after_the_daemon() {
 fn a_killed_process_is_seen_at_once_and_its_successor_streams_with_a_new_clock() {
     let home = Home::default();
     let process = Process::start(&home, "normal");
-    let rig = home.start(&text("")).unwrap();
+    let rig = home.start(&patient(&text(""))).unwrap();
     wait_until(&rig, "streaming", all_stream);
     std::thread::sleep(Duration::from_millis(500));
     process.signal("KILL");
@@ -161,7 +166,7 @@ fn a_killed_process_is_seen_at_once_and_its_successor_streams_with_a_new_clock()
 fn a_stopped_process_is_hung_and_goes_on_when_it_wakes() {
     let home = Home::default();
     let process = Process::start(&home, "normal");
-    let rig = home.start(&text("")).unwrap();
+    let rig = home.start(&patient(&text(""))).unwrap();
     wait_until(&rig, "streaming", all_stream);
     process.signal("STOP");
     let said = format!("its process {} has said nothing for", process.child.id());
@@ -178,7 +183,7 @@ fn a_stopped_process_is_hung_and_goes_on_when_it_wakes() {
 fn a_frame_announced_and_not_sent_ends_the_session_and_both_sides_report_it() {
     let home = Home::default();
     let process = Process::start(&home, "other_size");
-    let rig = home.start(&text("")).unwrap();
+    let rig = home.start(&patient(&text(""))).unwrap();
     let status = wait_until(&rig, "the lie", |s| says(s, "does not send what it announced"));
     assert!(says(&status, "160x120"), "{:?}", ext(&status).message);
     process.says("refused: 8 frames in a row are not");
@@ -264,7 +269,7 @@ fn offers_that_cannot_be_are_refused_by_name() {
     ] {
         let home = Home::default();
         let process = Process::start(&home, &format!("offers_{lie}"));
-        let rig = home.start(&text("")).unwrap();
+        let rig = home.start(&patient(&text(""))).unwrap();
         let status = wait_until(&rig, lie, |s| says(s, part));
         assert_eq!(ext(&status).state, CameraState::Reconnecting);
         process.says(part);
@@ -287,7 +292,8 @@ fn what_the_process_says_is_what_the_status_says() {
         ("refuses", CameraState::Failed, "(unsupported): this sensor has no such mode today"),
     ] {
         let home = Home::default();
-        let rig = home.start(&text("")).unwrap(); // a camera that has failed by then would fail the start
+        // A camera that has failed by then would fail the start.
+        let rig = home.start(&patient(&text(""))).unwrap();
         let process = Process::start(&home, behaviour);
         let status = wait_until(&rig, behaviour, |s| ext(s).state == state && says(s, part));
         if behaviour == "finishes" {
@@ -302,7 +308,7 @@ fn what_the_process_says_is_what_the_status_says() {
 fn a_process_without_frames_is_stalled_and_opened_again() {
     let home = Home::default();
     let _process = Process::start(&home, "mute");
-    let rig = home.start(&text("start_timeout_s = 0.5")).unwrap();
+    let rig = home.start(&patient(&text("start_timeout_s = 0.5"))).unwrap();
     let status = wait_until(&rig, "the silence", |s| says(s, "sent no frame within 0.5 s"));
     assert!(says(&status, "(its state is \"starting\")"), "{:?}", ext(&status).message);
     stop(rig);
@@ -311,7 +317,7 @@ fn a_process_without_frames_is_stalled_and_opened_again() {
 #[test]
 fn the_daemon_starts_the_process_starts_it_again_and_ends_it() {
     let home = Home::default();
-    let rig = home.start(&text(&command("normal"))).unwrap();
+    let rig = home.start(&patient(&text(&command("normal")))).unwrap();
     let first = pid(&wait_until(&rig, "streaming", all_stream));
     assert!(lives(first));
     signal(first, "KILL");

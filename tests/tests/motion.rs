@@ -9,7 +9,7 @@ use depthrig_daemon::status::{CameraState, RigStatus, StreamStatus};
 use depthrig_recorder::{
     CompareOptions, Dataset, DatasetSet, PixelCheck, SetRange, Severity, VerifyOptions, compare, verify,
 };
-use depthrig_tests::{Home, RigText, all_stream, assert_balanced, camera, wait_until};
+use depthrig_tests::{Home, RigText, all_stream, assert_balanced, assert_undisturbed, camera, wait_until};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -61,13 +61,20 @@ fn watched<T>(home: &Home, during: impl FnOnce() -> T) -> (T, Watched) {
     })
 }
 
-/// Records for `length` after the first set; when it had begun, and where it is.
+/// Records for `length` after the first set, or for longer until there are enough batches; when it had begun, and where
+/// it is.
 fn record(rig: &Rig, into: &Path, length: Duration) -> (HostTime, PathBuf) {
     let request = RecordRequest { directory: Some(into.to_owned()), ..RecordRequest::default() };
     let recording = rig.control().record_start(&request).unwrap();
     let began = HostTime::now();
-    wait_until(rig, "sets", |s| s.recording.as_ref().is_some_and(|r| r.active && r.sets > 0));
+    let status = wait_until(rig, "sets", |s| s.recording.as_ref().is_some_and(|r| r.active && r.sets > 0));
+    let before = UNITS.map(|id| unit(&status, id).in_sets.used);
     std::thread::sleep(length);
+    // Of 25 a second; a busy computer has fewer.
+    let enough = length.as_millis() as u64 / 50;
+    wait_until(rig, "batches", |s| {
+        UNITS.iter().zip(before).all(|(id, before)| unit(s, id).in_sets.used > before + enough)
+    });
     let stopped = rig.control().record_stop().unwrap();
     assert_eq!((stopped.error, stopped.dropped.len()), (None, 0));
     (began, recording.path.into())
@@ -165,7 +172,7 @@ fn every_batch_of_a_recording_is_in_its_sets_once_and_in_order_and_the_next_reco
     });
     let summary = rig.stop();
     assert_balanced(&summary.status);
-    assert!(summary.lost.is_empty(), "{:?}", summary.lost);
+    summary.status.cameras.iter().for_each(assert_undisturbed);
     let numbers: Vec<_> = recorded
         .iter()
         .map(|(began, data)| {
@@ -195,7 +202,10 @@ fn a_unit_that_is_unplugged_goes_on_in_the_same_recording() {
         let request = RecordRequest { directory: Some(home.path("data")), ..RecordRequest::default() };
         let recording = rig.control().record_start(&request).unwrap();
         let began = HostTime::now();
-        wait_until(&rig, "unplugged", |s| camera(s, "right").state == CameraState::Reconnecting);
+        wait_until(&rig, "unplugged", |s| {
+            let right = camera(s, "right");
+            right.state == CameraState::Reconnecting || right.reconnects > 0
+        });
         wait_until(&rig, "back", |s| camera(s, "right").state == CameraState::Streaming);
         let before = UNITS.map(|id| unit(&rig.control().status(), id).in_sets.used);
         wait_until(&rig, "recorded again", |s| {
@@ -220,7 +230,8 @@ fn a_unit_that_is_unplugged_goes_on_in_the_same_recording() {
     let samples: Vec<_> = of_right.iter().flat_map(|m| &m.samples).map(|s| s.sequence).collect();
     assert!(samples.is_sorted_by(|a, b| a < b), "the numbers of samples rise all the same");
     let skipped = unit(&summary.status, "right/imu").dropped.get("device_gap").copied();
-    assert_eq!(skipped, Some(3), "what the device skipped is counted as batches");
+    // A busy computer may be too late for more.
+    assert!(skipped >= Some(3), "what the device skipped is counted as batches: {skipped:?}");
 }
 
 #[test]

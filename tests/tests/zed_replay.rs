@@ -12,7 +12,7 @@ use depthrig_recorder::{
 use depthrig_stereo::Mode;
 use depthrig_tests::synthetic_stereo::SyntheticStereo;
 use depthrig_zed::replay::fake;
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
@@ -386,14 +386,16 @@ fn long() -> SyntheticStereo {
     }
 }
 
-/// Not a test of its own: the child that the test below starts and kills. It prints its progress.
+/// Not a test of its own: the child that the test below starts and kills. It prints its progress and goes on after
+/// each line that it gets.
 #[test]
 fn child() {
     let Some(dir) = std::env::var_os(KILL).map(PathBuf::from) else { return };
     let options = options(&CLASSICAL[..1], 1);
     let report = zed_replay(&dir.join("source"), &dir.join("out"), &options, &mut |_, done, _| {
         println!("done {done}");
-        // Slow enough to be killed in between.
+        std::io::stdin().read_line(&mut String::new()).unwrap();
+        // Slow enough for its segments to be finished meanwhile.
         std::thread::sleep(std::time::Duration::from_millis(4));
         ControlFlow::Continue(())
     });
@@ -405,17 +407,21 @@ fn run_child(dir: &Path, after: u64) -> Option<u64> {
     let mut child = Command::new(std::env::current_exe().unwrap())
         .args(["--exact", "child", "--nocapture"])
         .env(KILL, dir)
+        .stdin(Stdio::piped())
         .stdout(Stdio::piped())
         .spawn()
         .unwrap();
     let mut resumed = None;
+    let mut stdin = child.stdin.take().unwrap();
     for line in BufReader::new(child.stdout.take().unwrap()).lines() {
         let line = line.unwrap_or_default();
-        if let Some(n) = line.strip_prefix("done ").and_then(|n| n.parse::<u64>().ok())
-            && n >= after
-        {
-            child.kill().unwrap();
-            break;
+        // The first may come behind the name of the test.
+        if let Some((_, n)) = line.split_once("done ") {
+            if n.parse::<u64>().unwrap() >= after {
+                child.kill().unwrap();
+                break;
+            }
+            writeln!(stdin).unwrap();
         }
         resumed = resumed.or_else(|| line.strip_prefix("resumed ")?.parse().ok());
     }

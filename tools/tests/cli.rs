@@ -230,10 +230,12 @@ fn the_whole_way_of_a_small_rig() {
     let said = home.run(&["edit", out.join("first").to_str().unwrap(), "--scene", "table"]);
     assert_eq!(said.code, 2, "what is being recorded is not edited: {}", said.err);
     home.run(&["record", "stop"]).good();
+    let dataset = out.join("first");
+    // The end waits for the report for some seconds only.
+    support::wait(|| dataset.join("report.html").exists(), "a recording ends with its report");
     let summary = running.interrupt();
     assert_eq!(summary.code, 0, "{}\n{}", summary.out, summary.err);
 
-    let dataset = out.join("first");
     check_dataset(&home, &dataset);
 }
 
@@ -335,7 +337,10 @@ fn a_run_that_lost_frames_ends_with_3_and_says_which() {
     );
     let ran = home.run(&["run", &rig, "--seconds", "1.5", "-q"]);
     assert_eq!(ran.code, 3, "{}{}", ran.out, ran.err);
-    assert!(ran.out.contains("lost: cam/color: 3 of") && ran.out.contains("3 device_gap"), "{}", ran.out);
+    // A busy computer may be too late for more.
+    let lost = |line: &str| line.strip_prefix("lost: cam/color: ")?.split(' ').next()?.parse::<u64>().ok();
+    let lost = ran.out.lines().find_map(lost).unwrap_or(0);
+    assert!(lost >= 3 && ran.out.contains(&format!("({lost} device_gap)")), "{}", ran.out);
 }
 
 /// The option that a refusal advises exists: `run --record` suggests `--force`, and accepts it.

@@ -298,7 +298,7 @@ fn a_recording_with_truth_is_compared_in_one_view() {
         let rig = home.write("rig.toml", &text(truth));
         let out = home.path().join(name);
         let said =
-            home.run(&["run", &rig, "--record", out.to_str().unwrap(), "--seconds", "2", "--json", "-q"]);
+            home.run(&["run", &rig, "--record", out.to_str().unwrap(), "--seconds", "4", "--json", "-q"]);
         let summary: Value = serde_json::from_str(&said.done()).unwrap();
         summary["recording"]["path"].as_str().unwrap().to_owned()
     };
@@ -353,7 +353,7 @@ fn each_camera_of_a_relabelled_dataset_counts_once() {
     let rig = format!("rig = \"sim\"\n[recording]\nreserve_mb = 16\n{}{}", camera("left"), camera("right"));
     let rig = home.write("rig.toml", &rig);
     let at = |name: &str| home.path().join(name).to_str().unwrap().to_owned();
-    let said = home.run(&["run", &rig, "--record", &at("data"), "--seconds", "2", "--json", "-q"]);
+    let said = home.run(&["run", &rig, "--record", &at("data"), "--seconds", "4", "--json", "-q"]);
     let summary: Value = serde_json::from_str(&said.done()).unwrap();
     let path = summary["recording"]["path"].as_str().unwrap();
     home.run(&["cdm", "relabel", path, &at("again"), "--engine", "fill", "-q"]).done();

@@ -33,7 +33,10 @@ fn an_imu_is_tapped_shown_and_recorded() {
         .flat_map(|b| b["samples"].as_array().unwrap())
         .map(|s| s["sequence"].as_u64().unwrap())
         .collect();
-    assert!(numbers.len() == 16 && numbers.windows(2).all(|w| w[1] == w[0] + 1), "{numbers:?}");
+    let in_order = |batch: &[u64]| batch.windows(2).all(|w| w[1] == w[0] + 1);
+    assert!(numbers.len() == 16 && numbers.chunks(8).all(in_order), "{numbers:?}");
+    // A busy computer may be too late for batches between the two.
+    assert!(numbers[8] > numbers[7] && (numbers[8] - numbers[7]) % 8 == 1, "{numbers:?}");
     let images = home.path().join("images");
     for (wrong, why) in [
         (
@@ -57,7 +60,11 @@ fn an_imu_is_tapped_shown_and_recorded() {
     let data = out.join("moving");
     let info = home.run(&["info", data.to_str().unwrap()]).good();
     let row = info.lines().find(|l| l.starts_with("cam/imu")).unwrap();
-    assert!(row.split_whitespace().last() == Some("0"), "no batch is lost: {info}");
+    let lost = row.split_whitespace().last().unwrap().parse::<u64>().unwrap();
+    let status: serde_json::Value = serde_json::from_str(&home.run(&["status", "--json"]).good()).unwrap();
+    let streams = status["cameras"][0]["streams"].as_array().unwrap();
+    let missed = streams.iter().find(|s| s["id"] == "cam/imu").unwrap()["in_sets"]["missed"].as_u64();
+    assert!(Some(lost) <= missed, "no batch is lost but those that the rig missed, {missed:?}: {info}");
     home.run(&["verify", data.to_str().unwrap(), "--decode"]).good();
     // 3: on a busy machine an image is lost now and then.
     assert!(matches!(running.signal("TERM").code, 0 | 3));

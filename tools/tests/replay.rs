@@ -67,11 +67,11 @@ fn one_terminal_replays_and_another_one_steers() {
     home.run(&["record", "stop"]).good();
     home.run(&["verify", again.join("a").to_str().unwrap()]).good();
 
+    support::wait(|| again.join("a/report.html").exists(), "a recording of a replay ends with its report");
     let ended = running.interrupt();
     assert_eq!(ended.code, 0, "{}", ended.err);
     let result: serde_json::Value = serde_json::from_str(&ended.out).unwrap();
     assert_eq!((result["paused"].as_bool(), result["recording"]["sets"].as_u64()), (Some(true), Some(1)));
-    assert!(again.join("a/report.html").is_file(), "made after `record stop`, and waited for at the end");
     let none = home.run(&["replay", "status"]);
     assert_eq!(none.code, 1);
 }

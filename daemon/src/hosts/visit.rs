@@ -85,7 +85,11 @@ impl Hosts {
             let what = format!(
                 "it records {other}, which is no part of this recording; depthrig --host {name} record stop ends it"
             );
-            lock(&self.sessions).excuse_of(&session.name, name, what);
+            let mut sessions = lock(&self.sessions);
+            sessions.excuse_of(&session.name, name, what);
+            // Whoever waits for it asks for the status at once, before the next look at the host.
+            lock(&host.seen).why = sessions.excuse(name);
+            drop(sessions);
             self.changed.notify_all();
             return;
         }
@@ -110,6 +114,7 @@ impl Hosts {
                     tracing::error!("host {name}: {what}");
                 }
                 sessions.take_back(&session.name, name, &part, what);
+                lock(&host.seen).why = sessions.excuse(name);
             }
         }
         self.changed.notify_all();

@@ -7,6 +7,7 @@ use depthrig_bus::external::{
 use depthrig_bus::{DropReason, HostTime, Name, PixelFormat, RuntimeDir};
 use depthrig_driver::{Backend, ErrorKind, MemorySink, Poll, Stream};
 use depthrig_external::{ExternalBackend, ExternalConfig};
+use std::sync::mpsc::channel;
 use std::time::Duration;
 
 const WAIT: Duration = Duration::from_secs(20);
@@ -68,16 +69,22 @@ fn take(stream: &mut Box<dyn Stream>, sink: &mut MemorySink, frames: usize) {
 #[test]
 fn frames_of_another_session_or_process_are_passed_over() {
     let dir = tempfile::tempdir().unwrap();
-    let process = serve(&place(&dir), |session| {
+    // The channel keeps four frames for a reader that a busy computer makes late.
+    let (taken, wait) = channel();
+    let process = serve(&place(&dir), move |session| {
         for value in 1..=6 {
             send(session, value, |_| ());
             send(session, 100 + value, |h| h.session -= 1);
             send(session, 200 + value, |h| h.instance ^= 2);
+            wait.recv().unwrap();
         }
     });
     let mut stream = open(&place(&dir));
     let mut sink = MemorySink::default();
-    take(&mut stream, &mut sink, 6);
+    for frames in 1..=6 {
+        take(&mut stream, &mut sink, frames);
+        taken.send(()).unwrap();
+    }
     drop(stream);
     assert_eq!(sink.frames.iter().map(|f| f.2[0]).collect::<Vec<_>>(), [1, 2, 3, 4, 5, 6]);
     process.join().unwrap();
@@ -106,8 +113,10 @@ fn what_the_process_had_and_did_not_send_is_counted() {
 #[test]
 fn headers_that_are_none_end_the_session() {
     let dir = tempfile::tempdir().unwrap();
-    let process = serve(&place(&dir), |session| {
+    let (taken, wait) = channel();
+    let process = serve(&place(&dir), move |session| {
         send(session, 1, |_| ());
+        wait.recv().unwrap();
         while session.is_wanted() {
             send(session, 2, |h| h.version = 9);
         }
@@ -115,6 +124,8 @@ fn headers_that_are_none_end_the_session() {
     });
     let mut stream = open(&place(&dir));
     let mut sink = MemorySink::default();
+    take(&mut stream, &mut sink, 1);
+    taken.send(()).unwrap();
     let e = end_of(&mut stream, &mut sink);
     assert_eq!((e.kind(), sink.frames.len()), (ErrorKind::Protocol, 1));
     assert!(e.to_string().contains("does not send what it announced"), "{e}");
@@ -136,19 +147,27 @@ fn end_of(stream: &mut Box<dyn Stream>, sink: &mut MemorySink) -> depthrig_drive
 #[test]
 fn damaged_and_half_frames_are_counted_and_end_nothing() {
     let dir = tempfile::tempdir().unwrap();
-    let process = serve(&place(&dir), |session| {
-        send(session, 1, |_| ());
-        for value in 2..=11 {
-            send(session, value, |h| h.flags |= ExternalFrameFlags::DAMAGED.0);
+    let (taken, wait) = channel();
+    let process = serve(&place(&dir), move |session| {
+        for value in 1..=22 {
+            send(session, value, |h| match value {
+                2..=11 => h.flags |= ExternalFrameFlags::DAMAGED.0,
+                12..=21 => h.payload_len /= 2,
+                _ => (),
+            });
+            wait.recv().unwrap();
         }
-        for value in 12..=21 {
-            send(session, value, |h| h.payload_len /= 2);
-        }
-        send(session, 22, |_| ());
     });
     let mut stream = open(&place(&dir));
     let mut sink = MemorySink::default();
-    take(&mut stream, &mut sink, 2);
+    let deadline = HostTime::now().plus(WAIT);
+    for frames in 1..=22 {
+        while sink.delivered(0) + sink.drops_of(0).total() < frames {
+            assert!(!deadline.from_now().is_zero(), "{} frames, {:?}", sink.frames.len(), sink.drops);
+            stream.poll(Duration::from_millis(20), &mut sink).unwrap();
+        }
+        taken.send(()).unwrap();
+    }
     drop(stream);
     assert_eq!(sink.frames.iter().map(|f| f.2[0]).collect::<Vec<_>>(), [1, 22]);
     let drops = sink.drops[0];

@@ -138,8 +138,10 @@ fn padded_rows_and_captures_in_part_are_read() {
     poll_frames(stream.as_mut(), &mut sink, 2);
     fake.command(A, "only_depth", 2);
     poll_frames(stream.as_mut(), &mut sink, 4);
-    assert_eq!(sink.drops_of(0).get(DropReason::DeviceGap), 2);
-    assert_eq!(sink.drops_of(1).total(), 0);
+    // A slow machine may leave images lying, beside the two that did not come.
+    let [color, depth] = [0, 1].map(|of| fake.ledger(A, of).lost);
+    assert!(color >= 2);
+    assert_eq!((sink.drops_of(0).get(DropReason::DeviceGap), sink.drops_of(1).total()), (color, depth));
     drop(stream);
     // Images of another format than was asked for are dropped, whatever their size.
     for color in [PixelFormat::Yuyv, PixelFormat::Mjpeg, PixelFormat::Bgr8] {
@@ -493,7 +495,9 @@ fn imu_samples_are_those_of_the_device() {
         samples.iter().map(late).max()
     );
     assert_eq!(sink.captured[1], sink.delivered(1));
-    assert_eq!(sink.drops_of(0).total() + sink.drops_of(2).total(), 0);
+    // A slow machine may leave images lying, which the camera sent.
+    let [color, depth] = [0, 1].map(|of| fake.ledger(A, of).lost);
+    assert_eq!((sink.drops_of(0).total(), sink.drops_of(2).total()), (color, depth));
 
     // It breaks off, and images go on.
     fake.command(A, "imu_ends", 1);

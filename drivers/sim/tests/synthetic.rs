@@ -333,7 +333,7 @@ fn the_schedule_of_the_configuration_happens() {
     let mut config = cheap(200.0);
     let at = |at_s, kind, duration_s, count| ScheduledFault { at_s, kind, duration_s, count };
     config.faults = vec![
-        at(0.9, FaultKind::Unplug, 0.3, 1),
+        at(0.9, FaultKind::Unplug, 2.0, 1),
         at(0.1, FaultKind::Damaged, 0.0, 3),
         at(0.2, FaultKind::Skip, 0.0, 4),
     ];
@@ -348,15 +348,20 @@ fn the_schedule_of_the_configuration_happens() {
     };
     assert_eq!(e.kind(), ErrorKind::Disconnected);
     assert!(e.to_string().contains("sim-generic"), "{e}");
-    assert_eq!(sink.drops_of(0).get(DropReason::DeviceError), 3);
-    assert!(sink.drops_of(0).get(DropReason::DeviceGap) >= 4);
+    // A busy computer may leave frames lying until they are lost, damaged ones too: 40 ms are enough.
+    let [damaged, lost] = [DropReason::DeviceError, DropReason::DeviceGap].map(|r| sink.drops_of(0).get(r));
+    assert!((1..=3).contains(&damaged) && lost >= 4 + (3 - damaged), "{damaged} damaged, {lost} lost");
     let counters: Vec<u64> = sink.frames.iter().map(|f| f.1.device_sequence).collect();
     assert!(counters.windows(2).any(|w| w[1] < w[0]), "the reset restarted the frame counter");
     drop(stream);
     let e = backend.open(None).err().expect("it is unplugged");
     assert_eq!(e.kind(), ErrorKind::NotFound);
     assert!(backend.discover().unwrap().is_empty());
-    std::thread::sleep(Duration::from_millis(350));
+    let deadline = HostTime::now().plus(Duration::from_secs(20));
+    while backend.discover().unwrap().is_empty() {
+        assert!(!deadline.from_now().is_zero(), "it is not plugged in again");
+        std::thread::sleep(Duration::from_millis(20));
+    }
     assert_eq!(backend.discover().unwrap().len(), 1);
     assert!(backend.open(None).is_ok());
 }
@@ -467,5 +472,7 @@ fn an_imu_measures_the_truth_of_the_moment_that_its_samples_claim() {
             last = Some((meta.clock_epoch, s));
         }
     }
-    assert!(gaps.len() >= 3 && gaps.contains(&16), "two batches skipped, a reset, an unplug: {gaps:?}");
+    // A busy computer may be too late for more batches of eight.
+    let skipped = gaps.iter().any(|gap| *gap >= 16 && gap.is_multiple_of(8));
+    assert!(gaps.len() >= 3 && skipped, "two batches skipped, a reset, an unplug: {gaps:?}");
 }

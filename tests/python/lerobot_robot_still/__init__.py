@@ -74,9 +74,9 @@ class StillRobot(Still, Robot):
         seen: dict[str, Any] = dict(STILL)
         for name, camera in self.cameras.items():
             if getattr(camera, "use_rgb", True):
-                seen[name] = camera.read_latest()
+                seen[name] = camera.read_latest(60_000)
             if getattr(camera, "use_depth", False):
-                seen[f"{name}_depth"] = camera.read_latest_depth()
+                seen[f"{name}_depth"] = camera.read_latest_depth(60_000)
         return seen
 
     def send_action(self, action: dict) -> dict:

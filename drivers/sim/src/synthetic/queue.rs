@@ -41,7 +41,8 @@ pub(crate) struct Queue {
     /// Faults of the next frames: what, and of how many.
     spoils: VecDeque<(FaultKind, u32)>,
     waiting: VecDeque<Waiting>,
-    handed_any: bool,
+    /// Number of the boot of the last frame that was handed over.
+    handed: Option<u32>,
 }
 
 impl Queue {
@@ -68,7 +69,7 @@ impl Queue {
             stalls: Vec::new(),
             spoils: VecDeque::new(),
             waiting: VecDeque::new(),
-            handed_any: false,
+            handed: None,
         }
     }
 
@@ -87,7 +88,7 @@ impl Queue {
     pub(crate) fn expose_until(&mut self, until: HostTime, timeline: &Timeline, boot: Boot) {
         if boot.number != self.boot.number {
             self.next_k = 0;
-            self.lost = 0; // the host cannot know of frames lost before a counter restarts
+            self.lost = 0;
         }
         self.boot = boot;
         loop {
@@ -183,10 +184,9 @@ impl Queue {
     /// Takes the first waiting frame.
     pub(crate) fn pop(&mut self) -> Option<Waiting> {
         let mut frame = self.waiting.pop_front()?;
-        if !self.handed_any {
-            // The host cannot know of frames lost before the first frame of a session.
+        if self.handed.replace(frame.boot.number) != Some(frame.boot.number) {
+            // The host cannot know of frames lost before the first frame of a session, or before a counter restarts.
             frame.lost_before = 0;
-            self.handed_any = true;
         }
         Some(frame)
     }
@@ -268,5 +268,15 @@ mod tests {
             got.iter().map(|w| (w.k, w.boot.number, w.lost_before)).take(3).collect::<Vec<_>>(),
             [(0, 0, 0), (1, 0, 0), (0, 1, 0)]
         );
+    }
+
+    #[test]
+    fn frames_lost_between_a_reset_and_the_first_one_after_it_are_no_gap() {
+        let (mut q, t) = queue(ClockSim::default());
+        q.expose_until(ms(21), &t, BOOT);
+        assert_eq!(drain(&mut q, ms(21)).len(), 2);
+        q.expose_until(ms(208), &t, Boot { number: 1, at: ms(30), set_back_us: 0 });
+        let got = drain(&mut q, ms(208));
+        assert!(got[0].k > 0 && got.iter().all(|w| w.lost_before == 0), "{got:?}");
     }
 }
