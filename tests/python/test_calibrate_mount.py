@@ -76,19 +76,22 @@ def test_a_printed_board_gives_the_true_poses(binary: str, runtime: Path, tmp_pa
     path.write_text(rig())
     tables = {table["name"]: table for table in tomllib.loads(rig())["camera"]}
     true: dict[str, Matrix] = {}
-    # A busy computer may lose sets; the board rests long enough for some of each place.
-    recording = ("run", str(path), "--record", str(tmp_path / "boards"), "--seconds", "30")
-    with running(binary, runtime, tmp_path / "log", *recording) as daemon:
-        for name in CAMERAS:
-            stated = of_file(tables[name]["pose"])
-            displaced = of_file(tables[name]["board"]["displaced"])
-            color = np.linalg.inv(stated) @ of_header(f"{name}/color", runtime)
-            true[name] = stated @ displaced @ color
-        daemon.wait(WAIT_S)
-    (dataset,) = (tmp_path / "boards").iterdir()
     out = tmp_path / "calibration.toml"
     arguments = ("--board", str(tmp_path / "board.toml"), "--out", str(out), "--json")
-    command(binary, runtime, "calibrate", "solve", str(dataset), *arguments, codes=(0, 3))
+    # The board rests long enough for some sets of each place. A very busy computer may lose them all the same.
+    for tries in (2, 1, 0):
+        recording = ("run", str(path), "--record", str(tmp_path / f"boards{tries}"), "--seconds", "30")
+        with running(binary, runtime, tmp_path / "log", *recording) as daemon:
+            for name in CAMERAS:
+                stated = of_file(tables[name]["pose"])
+                displaced = of_file(tables[name]["board"]["displaced"])
+                color = np.linalg.inv(stated) @ of_header(f"{name}/color", runtime)
+                true[name] = stated @ displaced @ color
+            daemon.wait(WAIT_S)
+        (dataset,) = (tmp_path / f"boards{tries}").iterdir()
+        codes = (0, 1, 3) if tries else (0, 3)
+        if command(binary, runtime, "calibrate", "solve", str(dataset), *arguments, codes=codes):
+            break
     found = {camera["name"]: camera for camera in tomllib.loads(out.read_text())["camera"]}
     assert set(found) == set(CAMERAS)
     for name in CAMERAS:
@@ -108,12 +111,14 @@ def test_a_printed_board_gives_the_true_poses(binary: str, runtime: Path, tmp_pa
     bumped = re.sub(rf"\[{at[0]},", f"[{at[0] + 0.002:.3f},", rig())
     assert bumped != rig()
     path.write_text(bumped)
-    recording = ("run", str(path), "--record", str(tmp_path / "bumped"), "--seconds", "16")
-    with running(binary, runtime, tmp_path / "log", *recording) as daemon:
-        daemon.wait(WAIT_S)
-    (dataset,) = (tmp_path / "bumped").iterdir()
-    checked = json.loads(
-        command(binary, runtime, "calibrate", "check", str(dataset), "--calibration", str(out), "--json", codes=(3,))
-    )
+    for tries in (2, 1, 0):
+        recording = ("run", str(path), "--record", str(tmp_path / f"bumped{tries}"), "--seconds", "16")
+        with running(binary, runtime, tmp_path / "log", *recording) as daemon:
+            daemon.wait(WAIT_S)
+        (dataset,) = (tmp_path / f"bumped{tries}").iterdir()
+        check = ("calibrate", "check", str(dataset), "--calibration", str(out), "--json")
+        checked = json.loads(command(binary, runtime, *check, codes=(0, 1, 3) if tries else (3,)) or '{"moved": []}')
+        if checked["moved"]:
+            break
     assert [m["camera"] for m in checked["moved"]] == ["d455"]
     assert abs(checked["moved"][0]["mm"] - 2.0) < 0.3
