@@ -7,7 +7,7 @@ use depthrig_bus::external::{
 use depthrig_bus::{DropReason, HostTime, Name, PixelFormat, RuntimeDir};
 use depthrig_driver::{Backend, ErrorKind, MemorySink, Poll, Stream};
 use depthrig_external::{ExternalBackend, ExternalConfig};
-use std::sync::mpsc::channel;
+use std::sync::mpsc::sync_channel;
 use std::time::Duration;
 
 const WAIT: Duration = Duration::from_secs(20);
@@ -70,7 +70,7 @@ fn take(stream: &mut Box<dyn Stream>, sink: &mut MemorySink, frames: usize) {
 fn frames_of_another_session_or_process_are_passed_over() {
     let dir = tempfile::tempdir().unwrap();
     // The channel keeps four frames for a reader that a busy computer makes late.
-    let (taken, wait) = channel();
+    let (taken, wait) = sync_channel(1);
     let process = serve(&place(&dir), move |session| {
         for value in 1..=6 {
             send(session, value, |_| ());
@@ -113,7 +113,7 @@ fn what_the_process_had_and_did_not_send_is_counted() {
 #[test]
 fn headers_that_are_none_end_the_session() {
     let dir = tempfile::tempdir().unwrap();
-    let (taken, wait) = channel();
+    let (taken, wait) = sync_channel(1);
     let process = serve(&place(&dir), move |session| {
         send(session, 1, |_| ());
         wait.recv().unwrap();
@@ -147,7 +147,7 @@ fn end_of(stream: &mut Box<dyn Stream>, sink: &mut MemorySink) -> depthrig_drive
 #[test]
 fn damaged_and_half_frames_are_counted_and_end_nothing() {
     let dir = tempfile::tempdir().unwrap();
-    let (taken, wait) = channel();
+    let (taken, wait) = sync_channel(1);
     let process = serve(&place(&dir), move |session| {
         for value in 1..=22 {
             send(session, value, |h| match value {
@@ -253,7 +253,7 @@ fn a_process_that_stops_by_itself_is_disconnected() {
     let mode = Mode::new(Name::new("color").unwrap(), PixelFormat::Mono8, 8, 6, 100.0);
     let about = About { model: "Bench".into(), ..About::default() };
     let mut camera = ExternalCamera::offer(&place, &about, &[mode]).unwrap();
-    let (done, wait) = std::sync::mpsc::sync_channel::<()>(1);
+    let (done, wait) = sync_channel::<()>(1);
     let process = std::thread::spawn(move || {
         let mut session = camera.next_session(WAIT).unwrap().unwrap();
         send(&mut session, 1, |_| ());
