@@ -477,6 +477,17 @@ def test_a_computer_that_cannot_be_part_of_the_rig_is_named_and_left_alone(
     assert not rig.data("there").exists() or not any(rig.data("there").iterdir())
 
 
+def test_a_computer_that_records_something_else_is_named_at_once(rig: Rig) -> None:
+    rig.start("here")
+    rig.start("there")
+    rig.ask("record", "start", "--name", "own", host="there")
+    said = rig.ask("record", "start", "--name", "mount", codes=(3,))
+    assert "host left: it records own, which is no part of this recording" in said
+    rig.ask("record", "stop", codes=(0, 3))
+    rig.ask("record", "stop", host="there", codes=(0, 3))
+    assert rig.session()["parts"] == []
+
+
 def test_a_part_ends_and_begins_with_the_recording_while_a_slow_wire_pulls(binary: str, tmp_path: Path) -> None:  # noqa: F811
     with two_computers(binary, tmp_path, "10mbit") as rig:
         rig.start("here")
