@@ -82,10 +82,9 @@ class Rig:
             DEPTHRIG_RUNTIME_DIR=str(self.runtime[host]),
             DEPTHRIG_TEST_DATA=str(DATA),
         )
+        wait_for(f"the daemon {host}", lambda: self.ask("status", host=host, codes=(0, 1, 3)))
         if host == "there" and "here" in self.daemons:
             self.wait_for_host("connected")
-        else:
-            wait_for(f"the daemon {host}", lambda: self.ask("status", host=host, codes=(0, 1, 3)))
         wait_for("its cameras", lambda: all(camera["state"] == "streaming" for camera in self.status(host)["cameras"]))
 
     def kill(self, host: str) -> None:
