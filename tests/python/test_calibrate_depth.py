@@ -68,7 +68,7 @@ def test_the_error_of_depth_is_found_and_corrected(binary: str, runtime: Path, t
     path.write_text(CAMERAS.replace("REFINE", ""))
     out = tmp_path / "calibration.toml"
     arguments = ("--board", str(tmp_path / "board.toml"), "-o", str(out), "--json")
-    # The board rests long enough for some sets of each place. A very busy computer may lose them all the same.
+    # The board rests long enough for several sets in each place; a very busy computer may lose every one of them.
     for tries in (2, 1, 0):
         recording = ("run", str(path), "--record", str(tmp_path / f"wall{tries}"), "--seconds", "26")
         with running(binary, runtime, tmp_path / "log", *recording) as daemon:

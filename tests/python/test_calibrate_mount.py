@@ -78,7 +78,7 @@ def test_a_printed_board_gives_the_true_poses(binary: str, runtime: Path, tmp_pa
     true: dict[str, Matrix] = {}
     out = tmp_path / "calibration.toml"
     arguments = ("--board", str(tmp_path / "board.toml"), "--out", str(out), "--json")
-    # The board rests long enough for some sets of each place. A very busy computer may lose them all the same.
+    # The board rests long enough for several sets in each place; a very busy computer may lose every one of them.
     for tries in (2, 1, 0):
         recording = ("run", str(path), "--record", str(tmp_path / f"boards{tries}"), "--seconds", "30")
         with running(binary, runtime, tmp_path / "log", *recording) as daemon:

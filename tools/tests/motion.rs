@@ -61,7 +61,7 @@ fn an_imu_is_tapped_shown_and_recorded() {
     let info = home.run(&["info", data.to_str().unwrap()]).good();
     let row = info.lines().find(|l| l.starts_with("cam/imu")).unwrap();
     let lost = row.split_whitespace().last().unwrap().parse::<u64>().unwrap();
-    let status: serde_json::Value = serde_json::from_str(&home.run(&["status", "--json"]).good()).unwrap();
+    let status: serde_json::Value = serde_json::from_str(&home.run(&["status", "--json"]).done()).unwrap();
     let streams = status["cameras"][0]["streams"].as_array().unwrap();
     let missed = streams.iter().find(|s| s["id"] == "cam/imu").unwrap()["in_sets"]["missed"].as_u64();
     assert!(Some(lost) <= missed, "no batch is lost but those that the rig missed, {missed:?}: {info}");

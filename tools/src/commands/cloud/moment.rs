@@ -99,7 +99,7 @@ fn set(dataset: &Dataset, id: Option<u64>) -> Result<DatasetSet> {
     Ok(reader.read(number, PixelMode::Stored)?)
 }
 
-/// The set in which the fewest streams are missing, the nearest to the middle of those. A set that cannot be read counts as the emptiest.
+/// Number of the set with the fewest missing streams within [`NEAR`] of the middle; of several the nearest to it. A set that cannot be read is chosen last.
 fn fullest_near_middle(reader: &mut SetReader) -> usize {
     let count = reader.times().len();
     let middle = count / 2;
